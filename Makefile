@@ -1,0 +1,36 @@
+# One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make bench`.
+VENV ?= .venv
+PYTHON ?= python3
+BIN := $(VENV)/bin
+WALK := build/walk.mcap
+
+.PHONY: run test lint bench clean
+
+# The environment is made once, and again when the project's needs change.
+$(BIN)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+$(WALK): | $(BIN)/.installed
+	mkdir -p $(dir $@)
+	$(BIN)/caneflow simulate walk --seed 1 --output $@
+
+run: $(BIN)/.installed $(WALK)
+	$(BIN)/caneflow run dataflow.yaml --replay $(WALK) --speed max --record build/track.mcap
+	$(BIN)/caneflow plot build/track.mcap --output build/track.png
+
+test: $(BIN)/.installed
+	$(BIN)/pytest
+
+lint: $(BIN)/.installed
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(BIN)/.installed
+	$(BIN)/pytest --benchmark-enable --benchmark-only
+
+clean:
+	rm -rf $(VENV) build

@@ -1,0 +1,1 @@
+"""Programs that bring samples in: one file per device, and one replayer. Only their own tests import them."""

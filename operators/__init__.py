@@ -1,0 +1,1 @@
+"""Programs that turn samples into samples: one file each. Nothing imports them but their own tests."""

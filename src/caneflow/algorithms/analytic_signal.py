@@ -1,0 +1,48 @@
+"""The analytic signal of radar scans along fast time: real samples in, complex ones out, limited to the pulse's band.
+
+A real scan holds every echo twice, at plus and minus the carrier, and so cannot tell approaching from receding. Its
+analytic signal keeps the positive half of the spectrum, doubled; what lies outside the pulse's band is only noise
+(cane.md row 2). The phase of an echo at range R is then -4 pi R carrier / c: it grows while the range shrinks, and
+positive Doppler means approaching.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import ifft, rfft
+
+from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
+
+
+def fast_time_frequencies(bins: int, range_step: float) -> NDArray[np.float64]:
+    """Frequency (Hz) of each line of the one-sided fast-time spectrum of `bins` samples; shape (bins // 2 + 1,).
+
+    `range_step` is the spacing of the samples in metres of range.
+    """
+    return np.arange(bins // 2 + 1) * (SPEED_OF_LIGHT / (2 * range_step * bins))
+
+
+class AnalyticSignal:
+    """A filter for scans of one shape; its gain is worked out once."""
+
+    def __init__(self, *, bins: int, range_step: float, carrier: float, bandwidth: float) -> None:
+        """For scans of `bins` samples every `range_step` m; `carrier` and `bandwidth` of the pulse in Hz.
+
+        Raises:
+            ValueError: the pulse's band lies outside of what the samples can hold.
+        """
+        frequencies = fast_time_frequencies(bins, range_step)
+        inside = np.abs(frequencies - carrier) <= bandwidth / 2
+        if not inside.any() or carrier >= frequencies[-1]:
+            raise ValueError(
+                f"a pulse at {carrier:.4g} Hz, {bandwidth:.3g} Hz wide, does not show in {bins} samples "
+                f"every {range_step:.4g} m: they hold 0..{frequencies[-1]:.4g} Hz"
+            )
+        self._gain = np.where(inside, np.float32(2), np.float32(0))
+        self._bins = bins
+
+    def __call__(self, scans: NDArray[np.number]) -> NDArray[np.complex64]:
+        """The analytic signals of real `scans`, shape (..., bins); same shape."""
+        one_sided = rfft(scans.astype(np.float32), axis=-1)
+        one_sided *= self._gain
+        signals: NDArray[np.complex64] = ifft(one_sided, self._bins, axis=-1, overwrite_x=True)
+        return signals

@@ -1,0 +1,32 @@
+"""What stands still in the radar's own frame, and its removal: direct coupling, the cane's tip, walls at rest.
+
+A running mean over the recent past, weighted exp(-age / time constant) (cane.md row 3). The age is elapsed time, so
+the mean is the same at any scan rate and forgets by itself across a gap.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Background:
+    """The running mean of complex scans."""
+
+    def __init__(self, time_constant: float) -> None:
+        """With the given `time_constant` (s) of forgetting."""
+        self._time_constant = time_constant
+        self._mean: NDArray[np.complex64] | None = None
+        self._weight = 0.0  # sum of exp(-age / time constant) over the scans seen
+
+    def remove(self, scan: NDArray[np.complex64], elapsed: float) -> NDArray[np.complex64]:
+        """`scan`, shape (M,), less the mean of the past and itself; the first one gives zeros.
+
+        `elapsed` is the time (s) since the scan before. Counting every scan with weight 1 when it arrives makes the
+        mean right from the first scan on: no start value has to fade out.
+        """
+        if self._mean is None:
+            self._mean = np.zeros_like(scan)
+        self._weight = self._weight * math.exp(-elapsed / self._time_constant) + 1.0
+        self._mean += (scan - self._mean) * np.float32(1.0 / self._weight)
+        return scan - self._mean

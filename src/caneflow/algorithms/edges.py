@@ -1,0 +1,34 @@
+"""The superior edge of a Doppler spectrum: where it falls off towards higher speed (paper IV.B, cane.md row 6)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The fall of one line's magnitude is steepest 0.94 of a resolution cell (1 / window length) beyond it, by the Hann
+# window's spectrum sinc(x) / (1 - x^2). Ground lies at many azimuths: their lines crowd below the fastest one and
+# pull the steepest fall of the expected spectrum back to 0.86..0.77 cell for fastest lines at 3..12 cells, seen
+# through a Gaussian beam of 50 deg. tests/test_edges.py works both out.
+EDGE_BEYOND_SPEED = 0.8  # resolution cells
+
+
+def superior_edges(
+    magnitudes: NDArray[np.floating],
+) -> tuple[NDArray[np.float64], NDArray[np.floating]]:
+    """Where each row falls off most steeply, and by how much.
+
+    Args:
+        magnitudes: shape (K, F), rows of magnitude over growing Doppler, F at least 4.
+
+    Returns:
+        Fractional column indices, shape (K,): the vertex of the parabola through the greatest difference between
+        neighbours and the two beside it. And those differences, shape (K,). A flat row gives some index and 0:
+        whether there is anything to see is not decided here.
+    """
+    falls = magnitudes[:, :-1] - magnitudes[:, 1:]
+    rows = np.arange(len(falls))
+    steepest = falls[:, 1:-1].argmax(axis=1) + 1
+    before, top, after = falls[rows, steepest - 1], falls[rows, steepest], falls[rows, steepest + 1]
+    curvature = before - 2 * top + after
+    curvature[curvature >= 0] = -np.inf  # flat, or steepest at the rim: no vertex, no shift
+    shift = 0.5 * (before - after) / curvature
+    # The difference between columns i and i + 1 belongs half way between them.
+    return steepest + 0.5 + np.clip(shift, -0.5, 0.5), top

@@ -1,0 +1,203 @@
+"""The paper's speed over ground: superior edges of the Doppler spectra along rays of the beam (section IV, eq. 1-4).
+
+One estimate per frame, over the newest `window` scans; it belongs to the window's middle. Rows cited are cane.md's.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+from numpy.typing import NDArray
+from scipy.fft import fft
+
+from caneflow.algorithms.attitude_history import AttitudeHistory
+from caneflow.algorithms.edges import EDGE_BEYOND_SPEED, superior_edges
+from caneflow.algorithms.footprint import CaneGeometry, Rays, antenna_height, pitch, rays_on_ground
+from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
+from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT, SlowTimeWindow, hann, speed_per_bin
+from caneflow.algorithms.rest import RestSettings, difference_and_floor, difference_weights, is_at_rest
+from caneflow.algorithms.rotations import Quaternion
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperSpeedSettings:
+    """What the paper leaves open, and our choice."""
+
+    window: Annotated[int, Ge(8)] = 64  # scans, N (row 4)
+    transform: Annotated[int, Ge(16)] = 256  # Doppler bins, zero-padded from the window
+    rays: Annotated[int, Ge(2)] = 16  # K (row 5)
+    rows_per_ray: Annotated[int, Ge(1)] = (
+        3  # spectra averaged over one cell of range resolution; 1: as in the paper
+    )
+    aperture_share: Annotated[float, Gt(0), Le(1)] = 0.8  # of the rig's aperture that the rays span
+    shallowest: Annotated[float, Gt(0)] = math.radians(18)  # rad, of a ray to the ground
+    steepest: Annotated[float, Lt(math.pi / 2)] = math.radians(80)  # rad
+    compensate_edge: bool = True  # take off what the edge lies beyond the speed (row 6)
+    edge_beyond_speed: Annotated[float, Ge(0)] = EDGE_BEYOND_SPEED  # resolution cells of the window
+    average: Literal["mean", "median", "weighted"] = (
+        "mean"  # f and g of eq. 3, 4 (row 7); weights: the fall's height
+    )
+    agreement: Annotated[float, Gt(0)] = 0.25  # m/s, from the rays' median, within which a ray agrees
+    fewest_rays: Annotated[int, Ge(1)] = 6  # that must agree
+    least_peak: Annotated[float, Gt(0)] = 4.0  # of a ray's Doppler power to the noise floor
+    alias_share: Annotated[float, Gt(0), Le(1)] = 0.9  # of the unambiguous radial speed up to which an edge counts
+    most_lost: Annotated[float, Ge(0), Lt(1)] = 0.25  # share of a window's scans that may be missing
+    rest: RestSettings = field(default_factory=RestSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedEstimate:
+    """Speed of the antenna over ground along the boresight's projection, and how far to trust it."""
+
+    speed: float  # m/s, eq. 3; 0 when not valid
+    quality: float  # m/s, eq. 4, spread over the rays: smaller is better; inf when not valid
+    rays: int  # that agree and were averaged
+    valid: bool
+    delay: float  # s from the window's middle, where the estimate belongs, to the newest scan
+
+
+class PaperSpeed:
+    """Takes moving returns frame by frame; its state is the sliding window."""
+
+    def __init__(self, settings: PaperSpeedSettings, geometry: CaneGeometry) -> None:
+        """Raises ValueError for settings that contradict each other."""
+        if settings.transform < settings.window:
+            raise ValueError(f"transform is {settings.transform}; it is at least window, {settings.window}")
+        if settings.shallowest >= settings.steepest:
+            raise ValueError(
+                f"shallowest is {settings.shallowest:.3g} rad; it is less than steepest, {settings.steepest:.3g}"
+            )
+        self._settings = settings
+        self._geometry = geometry
+        self._weights = hann(settings.window)
+        self._difference_weights = difference_weights(settings.transform)
+        self._offsets = np.linspace(-1.0, 1.0, settings.rays)
+        # Slow-time rows to transform; what lies behind the window stays 0.
+        self._padded = np.zeros((settings.rays * settings.rows_per_ray, settings.transform), np.complex64)
+        self._window = SlowTimeWindow(length=settings.window, bins=0)
+        self._stamps_ns: deque[int] = deque(maxlen=settings.window)
+        self._stand_ins: deque[bool] = deque(maxlen=settings.window)  # which scans of the window were lost
+        self._cell = np.zeros(1, dtype=np.intp)  # bins from a ray's row to the rows averaged with it
+        self._bins = 0
+
+    def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> SpeedEstimate:
+        """The estimate after one more frame.
+
+        Not valid while the window is not full or too much of it was lost, without an attitude for its middle, where
+        too few rays meet the ground or agree, and where the speed comes near the limit of unambiguous Doppler.
+        """
+        self._push(returns)
+        settings, period = self._settings, returns.parameters.scan_period
+        delay = (settings.window - 1) / 2 * period
+        if len(self._stamps_ns) < settings.window:
+            return _nothing(delay)
+        oldest_ns, newest_ns = self._stamps_ns[0], self._stamps_ns[-1]
+        delay = (newest_ns - oldest_ns) * 0.5e-9
+        orientation = attitudes.at((oldest_ns + newest_ns) // 2)
+        if orientation is None or sum(self._stand_ins) > settings.most_lost * settings.window:
+            return _nothing(delay)
+        rays = self._rays(orientation, returns.parameters)
+        if len(rays.rows) < settings.fewest_rays:
+            return _nothing(delay)
+        power = self._power(rays)
+        turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
+        total, floor = difference_and_floor(power.sum(axis=0), self._difference_weights)
+        if turn_rate is not None and is_at_rest(total, floor, turn_rate, settings.rest):
+            return SpeedEstimate(speed=0.0, quality=0.0, rays=len(rays.rows), valid=True, delay=delay)
+        per_bin = speed_per_bin(
+            scan_period=(newest_ns - oldest_ns) * 1e-9 / (settings.window - 1),  # measured, not nominal
+            carrier=returns.parameters.carrier,
+            transform=settings.transform,
+        )
+        speeds, weights = self._ray_speeds(power, floor / len(power), per_bin / rays.cosines)
+        return self._average(speeds, weights, delay)
+
+    def _push(self, returns: MovingReturns) -> None:
+        if returns.restarted:
+            self._start_anew(returns.scans.shape[1], returns.parameters)
+        for row, (scan, stamp_ns) in enumerate(zip(returns.scans, returns.stamps_ns, strict=True)):
+            self._window.push(scan)
+            self._stamps_ns.append(stamp_ns)
+            self._stand_ins.append(row < returns.lost)
+
+    def _start_anew(self, bins: int, parameters: RadarParameters) -> None:
+        settings = self._settings
+        self._window = SlowTimeWindow(length=settings.window, bins=bins)
+        self._stamps_ns.clear()
+        self._stand_ins.clear()
+        self._bins = bins
+        half_resolution = SPEED_OF_LIGHT / (4 * parameters.bandwidth) / parameters.range_step  # bins
+        spread = np.linspace(-1.0, 1.0, settings.rows_per_ray) if settings.rows_per_ray > 1 else np.zeros(1)
+        self._cell = np.rint(spread * half_resolution).astype(np.intp)
+
+    def _rays(self, orientation: Quaternion, parameters: RadarParameters) -> Rays:
+        settings, geometry = self._settings, self._geometry
+        return rays_on_ground(
+            self._offsets,
+            height=antenna_height(geometry, orientation),
+            axis=pitch(geometry, orientation),
+            half_width=0.5 * settings.aperture_share * geometry.aperture,
+            shallowest=settings.shallowest,
+            steepest=settings.steepest,
+            range_start=parameters.range_start,
+            range_step=parameters.range_step,
+            bins=self._bins,
+        )
+
+    def _power(self, rays: Rays) -> NDArray[np.float32]:
+        """Doppler power along each ray, in sum over its rows; shape (K, transform), FFT order."""
+        settings = self._settings
+        rows = np.clip(rays.rows[:, None] + self._cell, 0, self._bins - 1).ravel()
+        padded = self._padded[: len(rows)]
+        np.multiply(self._window.view()[rows], self._weights, out=padded[:, : settings.window])
+        spectra = fft(padded, axis=-1)
+        power = spectra.real**2 + spectra.imag**2
+        return power.reshape(len(rays.rows), settings.rows_per_ray, -1).sum(axis=1)
+
+    def _ray_speeds(
+        self, power: NDArray[np.float32], floor: float, per_bin: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Speed over ground (m/s, eq. 2) of the rays that show one, and their weights.
+
+        A ray shows one if its Doppler stands out of the noise `floor`, is mostly that of approaching ground (a speed
+        above the limit would come round on the other side), and its edge lies well below the limit.
+        """
+        settings = self._settings
+        half = settings.transform // 2
+        approaching = power[:, : half + 1]
+        edges, falls = superior_edges(np.sqrt(approaching))
+        cell = settings.transform / settings.window  # Doppler bins
+        clear = (approaching.max(axis=1) > settings.least_peak * floor) & (edges < settings.alias_share * half)
+        clear &= approaching.sum(axis=1) > power[:, half + 1 :].sum(axis=1)
+        if settings.compensate_edge:
+            edges = np.maximum(edges - settings.edge_beyond_speed * cell, 0.0)
+        return (edges * per_bin)[clear], falls[clear].astype(np.float64)
+
+    def _average(self, speeds: NDArray[np.float64], weights: NDArray[np.float64], delay: float) -> SpeedEstimate:
+        settings = self._settings
+        if len(speeds) < settings.fewest_rays:
+            return _nothing(delay)
+        agrees = np.abs(speeds - _median(speeds)) <= settings.agreement
+        speeds, weights = speeds[agrees], weights[agrees]
+        if len(speeds) < settings.fewest_rays:
+            return _nothing(delay)
+        if settings.average != "weighted":
+            weights = np.ones_like(speeds)
+        weights = weights / weights.sum()
+        mean = float((weights * speeds).sum())
+        centre = _median(speeds) if settings.average == "median" else mean
+        spread = math.sqrt(float((weights * (speeds - centre) ** 2).sum()))
+        return SpeedEstimate(speed=centre, quality=spread, rays=len(speeds), valid=True, delay=delay)
+
+
+def _nothing(delay: float) -> SpeedEstimate:
+    return SpeedEstimate(speed=0.0, quality=math.inf, rays=0, valid=False, delay=delay)
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    ordered = np.sort(values)  # numpy's median costs ten times as much for a handful
+    middle = len(ordered) // 2
+    return float(ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)

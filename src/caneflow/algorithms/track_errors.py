@@ -1,0 +1,156 @@
+"""How far a track lies from the truth (cane.md row 16): horizontal, start pose given, nothing else fitted.
+
+Aligned at start position and yaw only. A fit over the whole track would hide a constant scale or heading error.
+"""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caneflow.algorithms.rotations import Vector
+
+Floats: TypeAlias = NDArray[np.float64]
+Stamps: TypeAlias = NDArray[np.int64]
+
+START_NS = 500_000_000  # the yaw at the start is the mean of this long
+LARGEST_MISS_NS = 1_000_000_000  # a track that starts later or ends earlier than the truth by this is no track
+RELATIVE_LENGTH = 1.0  # m of truth's path over which the relative error is taken
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackErrors:
+    """Errors of one track; None where a figure has no meaning (a truth that does not move, or not far enough)."""
+
+    poses: int
+    duration: float  # s
+    length: float  # m, of the truth's path
+    final_distance: float  # m, end to start of the estimate: the paper's error, for closed walks
+    final_error: float  # m, end of the estimate to end of the truth
+    ate: float  # m, root mean square distance to the truth
+    rpe: (
+        float | None
+    )  # m, root mean square error of the displacement over RELATIVE_LENGTH, heading at its start given
+    drift_percent: float | None  # final_error in % of length
+    path_length_ratio: float | None  # length of the estimate's path over that of the truth: shows a constant scale
+    extent: float | None  # longer side of the estimate's bounding box over that of the truth
+    growth_rate: float  # m/s, final_distance over duration, as in Table I
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """Poses in time: stamps (n,) ns strictly increasing, positions (n, 3) m, orientations (n, 4) w x y z."""
+
+    stamps: Stamps
+    positions: Floats
+    orientations: Floats
+
+    def __post_init__(self) -> None:
+        count = len(self.stamps)
+        if count < 2:
+            raise ValueError(f"a track of {count} poses; at least 2 are needed")
+        if self.positions.shape != (count, 3) or self.orientations.shape != (count, 4):
+            raise ValueError(
+                f"{count} stamps, positions {self.positions.shape}, orientations {self.orientations.shape}; "
+                f"expected ({count}, 3) and ({count}, 4)"
+            )
+
+
+def track_errors(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0, 0.0)) -> TrackErrors:
+    """Errors of `estimate` against `truth`; `boresight` is the body vector whose yaw is aligned.
+
+    Raises ValueError when the estimate misses more than LARGEST_MISS_NS of either end of the truth.
+    """
+    _require_cover(estimate.stamps, truth.stamps)
+    origin = estimate.stamps[0]
+    times = (estimate.stamps - origin) * 1e-9
+    truth_times = (truth.stamps - origin) * 1e-9
+    yaw = boresight_yaws(estimate.orientations, boresight)
+    truth_yaw = boresight_yaws(truth.orientations, boresight)
+
+    turn = _start_turn(estimate.stamps, yaw, truth_yaw)
+    track = _turned((estimate.positions - estimate.positions[0])[:, :2], turn)
+    path = np.stack([np.interp(times, truth_times, truth.positions[:, axis]) for axis in (0, 1)], axis=1)
+    path -= path[0]
+    heading_error = yaw + turn - np.interp(times, truth_times, np.unwrap(truth_yaw))
+
+    errors = np.linalg.norm(track - path, axis=1)
+    length, final = path_length(path), float(errors[-1])
+    final_distance = float(np.linalg.norm(track[-1]))
+    duration = float(times[-1])
+    return TrackErrors(
+        poses=len(track),
+        duration=duration,
+        length=length,
+        final_distance=final_distance,
+        final_error=final,
+        ate=float(np.sqrt(np.mean(errors**2))),
+        rpe=relative_error(track, path, heading_error, RELATIVE_LENGTH),
+        drift_percent=_ratio(100.0 * final, length),
+        path_length_ratio=_ratio(path_length(track), length),
+        extent=_ratio(float(np.ptp(track, axis=0).max()), float(np.ptp(path, axis=0).max())),
+        growth_rate=final_distance / duration,
+    )
+
+
+def boresight_yaws(orientations: Floats, boresight: Vector) -> Floats:
+    """Yaw (rad, shape (n,)) of a body vector for orientations, shape (n, 4)."""
+    w, x, y, z = np.asarray(orientations, dtype=np.float64).T
+    a, b, c = boresight
+    east = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c
+    north = 2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c
+    yaw: Floats = np.arctan2(north, east)
+    return yaw
+
+
+def path_length(path: Floats) -> float:
+    """Length (m) of a polyline, shape (n, 2)."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+
+def relative_error(track: Floats, path: Floats, heading_error: Floats, length: float) -> float | None:
+    """Root mean square error (m) of the displacement over `length` m of the true path, from every pose on.
+
+    `track` and `path` have shape (n, 2), `heading_error` (rad) shape (n,): estimated less true yaw. Each estimated
+    displacement is turned back by the heading error at its start, so an old heading error does not count again.
+    None when the path is shorter than `length`.
+    """
+    travelled = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))))
+    ends = np.searchsorted(travelled, travelled + length)
+    starts = np.flatnonzero(ends < len(path))
+    if not len(starts):
+        return None
+    ends = ends[starts]
+    moved = _turned(track[ends] - track[starts], -heading_error[starts])
+    errors = moved - (path[ends] - path[starts])
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def _require_cover(stamps: Stamps, truth: Stamps) -> None:
+    if stamps[0] - truth[0] > LARGEST_MISS_NS or truth[-1] - stamps[-1] > LARGEST_MISS_NS:
+        late, early = (stamps[0] - truth[0]) * 1e-9, (truth[-1] - stamps[-1]) * 1e-9
+        raise ValueError(
+            f"the track starts {late:.2f} s after the truth and ends {early:.2f} s before it; "
+            f"at most {LARGEST_MISS_NS * 1e-9:g} s may be missing"
+        )
+
+
+def _start_turn(stamps: Stamps, yaw: Floats, truth_yaw: Floats) -> float:
+    """Angle (rad) that turns the estimate's yaw at the start into the truth's.
+
+    Both means are over as many poses as the estimate has in START_NS, counted from the first of each.
+    """
+    count = min(int(np.searchsorted(stamps, stamps[0] + START_NS)), len(truth_yaw))
+    return float(np.angle(np.mean(np.exp(1j * (truth_yaw[:count] - yaw[:count])))))
+
+
+def _turned(vectors: Floats, angle: float | Floats) -> Floats:
+    """Vectors, shape (n, 2), turned counter-clockwise by one angle or by one each (rad)."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
+
+
+def _ratio(value: float, of: float) -> float | None:
+    return value / of if of > 0 else None

@@ -1,0 +1,130 @@
+"""The door of the `caneflow` command: finds the tool for a word, and turns an expected error into one line."""
+
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Annotated, Any, NoReturn
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from caneflow import __version__
+from caneflow.errors import CaneflowError
+
+TOOLS = "caneflow.tools"
+USAGE_STATUS = 2  # exit status of an expected error, as of a misspelt option
+INTERRUPTED_STATUS = 130  # 128 + SIGINT, as a shell reports Ctrl-C
+
+# Word -> module in tools, one line of help. A tool has `command`, a function whose annotations are its options, or
+# `commands`, such functions by word. It is imported when its word is used: `caneflow check` needs no matplotlib.
+WORDS: dict[str, tuple[str, str]] = {
+    "run": ("run", "Run a flow: live, or from a recording."),
+    "check": ("check", "Find every mistake in a dataflow file; start nothing."),
+    "graph": ("graph", "Draw a flow."),
+    "verify": (
+        "verify",
+        "Run a recording through processes and in one process; say whether the outputs are equal.",
+    ),
+    "status": ("status", "Show the nodes and edges of a running flow."),
+    "hz": ("hz", "Show how often the samples of a running flow come."),
+    "echo": ("echo", "Print the samples of a running flow."),
+    "top": ("top", "Show what each node of a running flow costs."),
+    "doctor": ("doctor", "Say what is wrong with a running flow."),
+    "simulate": ("simulate", "Make a recording of a walk that nobody walked."),
+    "info": ("info", "Say what is in a recording."),
+    "recover": ("recover", "Make a sound recording of one that was cut short or damaged."),
+    "import": ("import_recording", "Make a recording of a device's own log."),
+    "export": ("export", "Write a stream of a recording for other programs."),
+    "emulate": ("emulate", "Play a device from a recording, for a driver to talk to."),
+    "eval": ("evaluate", "Compare methods over recordings with ground truth."),
+    "calibrate": ("calibrate", "Fit the rig to recordings."),
+    "plot": ("plot", "Draw a recording's track and speed."),
+    "view": ("view", "Show a running flow in the browser."),
+    "schema": ("schema", "Print the JSON Schema of a message or of a dataflow file."),
+    "new": ("new", "Start a program of your own."),
+    "keys": ("keys", "Make the keys of a secured flow."),
+    "mcu": ("mcu", "Prepare a microcontroller's program."),
+}
+
+
+class Word(TyperCommand):
+    """A word of the command in the place of its tool, which is imported when the word is used."""
+
+    def __init__(self, word: str, module: str, summary: str) -> None:
+        super().__init__(word, help=summary)
+        self._module = module
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """The context of the tool itself, to which typer hands over."""
+        return _tool(self._module).make_context(info_name, args, parent, **extra)
+
+
+def main() -> NoReturn:
+    """Run the command line's word; exit status 2 and one line for an expected error, a traceback for a bug."""
+    try:
+        _command().main(prog_name="caneflow")
+    except CaneflowError as error:
+        _fail(str(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _fail(f"{error.filename}: {error.strerror}")
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED_STATUS)
+    sys.exit()
+
+
+def _fail(message: str) -> NoReturn:
+    word = next((argument for argument in sys.argv[1:] if argument in WORDS), None)
+    print(f"caneflow {word}: {message}" if word else f"caneflow: {message}", file=sys.stderr)
+    sys.exit(USAGE_STATUS)
+
+
+def _command() -> TyperGroup:
+    app = _typer(no_args_is_help=True)
+    app.callback()(_caneflow)
+    group = typer.main.get_command(app)
+    assert isinstance(group, TyperGroup)
+    for word, (module, summary) in WORDS.items():
+        if find_spec(f"{TOOLS}.{module}"):
+            group.add_command(Word(word, module, summary))
+    return group
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"caneflow {__version__}")
+        raise typer.Exit
+
+
+def _caneflow(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Where a smart white cane is: radar and IMU as a distributed dataflow over Zenoh."""
+
+
+def _tool(module: str) -> Any:
+    """The command that the tool's functions make."""
+    tool = import_module(f"{TOOLS}.{module}")
+    app = _typer(add_completion=False)
+    if hasattr(tool, "commands"):
+        app.callback(help=tool.__doc__)(_no_options)
+        for word, function in tool.commands.items():
+            app.command(word)(function)
+    else:
+        app.command()(tool.command)
+    return typer.main.get_command(app)
+
+
+def _no_options() -> None:
+    """With a callback, typer asks for the second word even where there is only one."""
+
+
+def _typer(**settings: Any) -> typer.Typer:
+    return typer.Typer(pretty_exceptions_enable=False, rich_markup_mode="rich", **settings)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""The rig: what is bolted on, as opposed to what flows. One map, for every node and in every recording."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from caneflow.messages.errors import MessageError
+from caneflow.messages.samples import Vector3
+
+Area = tuple[float, float, float, float]
+
+
+class Sensor(BaseModel):
+    """One static Doppler module of a room."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    position: Annotated[Vector3, Field(description="m, R0")]
+    azimuth: Annotated[float, Field(description="rad, of the boresight, counter-clockwise from x0")]
+    k: Annotated[float | None, Field(gt=0, description="m^4: range = (k / amplitude^2)^(1/4)")] = None
+
+
+class Start(BaseModel):
+    """The user's guess of where a person starts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    position: Annotated[tuple[float, float], Field(description="m, R0")]
+    sd: Annotated[float, Field(gt=0, description="m")]
+
+
+class Rig(BaseModel):
+    """Everything that may be known of a rig; what is not known is None."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    boresight: Annotated[Vector3, Field(description="unit vector of the radar's axis, body frame")] = (
+        0.0,
+        1.0,
+        0.0,
+    )
+    hand_height: Annotated[float | None, Field(gt=0, description="m, of the hand above ground")] = None
+    aperture: Annotated[float | None, Field(gt=0, lt=3.2, description="rad, full -3 dB angle (delta)")] = None
+    pivot: Annotated[Vector3 | None, Field(description="m, from the sensors to the hand, body frame")] = None
+    antenna: Annotated[Vector3, Field(description="m, from IMU to antenna, body frame")] = (0.0, 0.0, 0.0)
+    step_length: Annotated[float | None, Field(gt=0, description="m, step-and-heading only")] = None
+    sensors: Annotated[dict[str, Sensor], Field(description="room: Doppler modules by node name")] = {}
+    area: Annotated[Area | None, Field(description="room: xmin, xmax, ymin, ymax, m")] = None
+    start: Annotated[Start | None, Field(description="room: the user's guess of the start")] = None
+
+    @field_validator("boresight")
+    @classmethod
+    def _unit(cls, boresight: Vector3) -> Vector3:
+        norm = sum(x * x for x in boresight) ** 0.5
+        if abs(norm - 1) > 1e-3:
+            raise ValueError(f"has norm {norm:.6g}; a direction has 1")
+        return boresight
+
+    def need(self, name: str) -> Any:
+        """The value of key `name`; raises MessageError when it is not known."""
+        value = getattr(self, name)
+        if value is None:
+            meaning = type(self).model_fields[name].description
+            raise MessageError(
+                f"rig.{name} is not known ({meaning}); write it under rig: in the yaml, or give --rig FILE"
+            )
+        return value
+
+
+def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """`above` laid over `below`, key by key, to any depth."""
+    merged = dict(below)
+    for key, value in above.items():
+        under = merged.get(key)
+        merged[key] = overlaid(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
+    return merged

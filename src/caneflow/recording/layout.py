@@ -1,0 +1,251 @@
+"""Where things are in an MCAP file: by its summary, or by a walk over its records when there is none."""
+
+import struct
+import zlib
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import BinaryIO, TypeAlias
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, Metadata, MetadataIndex, Schema, Statistics
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
+
+MAGIC = MCAP0_MAGIC  # at the start and at the end of the file
+RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
+FOOTER_LENGTH = RECORD.size + 20 + len(MAGIC)
+CHECKED_FOOTER = RECORD.size + 16  # bytes of the footer that its check sum covers
+MESSAGE = int(Opcode.MESSAGE)  # comparing with the enum's member takes as long as unpacking a message
+MAX_BARE = 2**20  # bytes of messages outside any chunk that are taken as one block
+
+# Stamp, seq, log time; where in the block's data the payload starts and ends. Plain, as thousands are made at once.
+Entry: TypeAlias = tuple[int, int, int, int, int]
+
+# What mcap, its two decompressors and struct raise on bytes that are not what they should be.
+DAMAGE = (
+    McapError,
+    ZstdError,
+    struct.error,
+    LookupError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,
+    ValueError,
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A stretch of the file with messages: one chunk, or messages that lie outside any chunk."""
+
+    offset: int  # byte at which its first record starts
+    length: int  # bytes
+    topics: frozenset[str]  # which have messages in it
+
+
+@dataclass
+class Declarations:
+    """Channels and schemas by their numbers in the file."""
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+
+    def note(self, opcode: int, body: bytes) -> None:
+        """Take in a record, if it declares something."""
+        if opcode == Opcode.CHANNEL:
+            channel = Channel.read(_stream(body))
+            self.channels[channel.id] = channel
+        elif opcode == Opcode.SCHEMA:
+            schema = Schema.read(_stream(body))
+            self.schemas[schema.id] = schema
+
+
+@dataclass
+class Layout:
+    """What is where in one file."""
+
+    complete: bool  # ends with its footer, as a file does whose writer was not killed
+    declared: Declarations = field(default_factory=Declarations)
+    blocks: list[Block] = field(default_factory=list)  # in the order of the file
+    counts: Counter[str] = field(default_factory=Counter)  # messages by topic
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    damaged: list[int] = field(default_factory=list)  # bytes at which records start that cannot be read
+
+
+class Content:
+    """The messages of one block: by topic, each in the order of the file."""
+
+    def __init__(self, data: bytes, declared: Declarations) -> None:
+        """Find the messages in `data`; what it declares on the way is added to `declared`."""
+        self.data = data
+        self.messages: defaultdict[str, list[Entry]] = defaultdict(list)
+        at = 0
+        while at < len(data):
+            opcode, length = RECORD.unpack_from(data, at)
+            body = at + RECORD.size
+            at = body + length
+            if at > len(data):
+                raise ValueError(f"a record reaches {at - len(data)} bytes beyond its block")
+            if opcode == MESSAGE:
+                if length < MESSAGE_HEAD.size:
+                    raise ValueError(f"a message of {length} bytes; its head alone has {MESSAGE_HEAD.size}")
+                number, seq, log_time, stamp = MESSAGE_HEAD.unpack_from(data, body)
+                topic = declared.channels[number].topic
+                self.messages[topic].append((stamp, seq, log_time, body + MESSAGE_HEAD.size, at))
+            else:
+                declared.note(opcode, data[body:at])
+
+
+def layout_of(file: BinaryIO) -> Layout:
+    """Where things are in `file`, by the summary at its end, or else by a walk. Needs the magic at its start."""
+    try:
+        by_summary = _summarised(file)
+    except DAMAGE:
+        by_summary = None
+    return by_summary or walked(file)
+
+
+def content_of(file: BinaryIO, block: Block, declared: Declarations) -> Content:
+    """The messages of `block`. Raises one of DAMAGE when its bytes are not sound."""
+    file.seek(block.offset)
+    raw = file.read(block.length)
+    if len(raw) < block.length:
+        raise ValueError(f"{len(raw)} of {block.length} bytes are there")
+    return Content(_unpacked(raw), declared)
+
+
+def walked(file: BinaryIO) -> Layout:
+    """Where things are in `file`, found record by record, up to its end or to where it was cut."""
+    layout = Layout(complete=False)
+    bare = bytearray()  # messages outside any chunk, as some writers leave them, gathered into blocks
+    end = len(MAGIC)
+    for opcode, offset, raw in _records(file):
+        if bare and (opcode != MESSAGE or len(bare) >= MAX_BARE):
+            _add_block(layout, offset - len(bare), bytes(bare))
+            bare.clear()
+        end = offset + len(raw)
+        if opcode == MESSAGE:
+            bare += raw
+        elif opcode == Opcode.CHUNK:
+            _add_block(layout, offset, raw)
+        elif opcode == Opcode.FOOTER:
+            layout.complete = True
+        else:
+            try:
+                _note(layout, opcode, raw[RECORD.size :])
+            except DAMAGE:
+                layout.damaged.append(offset)
+    if bare:
+        _add_block(layout, end - len(bare), bytes(bare))
+    return layout
+
+
+def _add_block(layout: Layout, offset: int, raw: bytes) -> None:
+    try:
+        content = Content(_unpacked(raw), layout.declared)
+    except DAMAGE:
+        layout.damaged.append(offset)
+        return
+    layout.blocks.append(Block(offset, len(raw), frozenset(content.messages)))
+    layout.counts.update({topic: len(entries) for topic, entries in content.messages.items()})
+
+
+def _note(layout: Layout, opcode: int, body: bytes) -> None:
+    """Take in a record without messages."""
+    if opcode == Opcode.METADATA:
+        metadata = Metadata.read(_stream(body))
+        layout.metadata[metadata.name] = metadata.metadata
+    else:
+        layout.declared.note(opcode, body)
+
+
+def _records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
+    """Opcode, offset and bytes of every whole record; the footer only when the file goes on to its magic."""
+    size = file.seek(0, 2)
+    at = len(MAGIC)
+    while at + RECORD.size <= size:
+        file.seek(at)
+        head = file.read(RECORD.size)
+        opcode, length = RECORD.unpack(head)
+        if opcode == 0 or length > size - at - len(head):  # 0: what some file systems leave after a power cut
+            return
+        raw = head + file.read(length)
+        if opcode == Opcode.FOOTER and file.read(len(MAGIC)) != MAGIC:
+            return
+        yield opcode, at, raw
+        if opcode == Opcode.FOOTER:
+            return
+        at += len(raw)
+
+
+def _summarised(file: BinaryIO) -> Layout | None:
+    """The layout that the summary gives; None when there is none, or none that says where each topic is."""
+    size = file.seek(0, 2)
+    if size < len(MAGIC) + FOOTER_LENGTH:
+        return None
+    file.seek(size - FOOTER_LENGTH)
+    end = file.read(FOOTER_LENGTH)
+    if end[0] != Opcode.FOOTER or not end.endswith(MAGIC):
+        return None
+    footer = Footer.read(_stream(end[RECORD.size :]))
+    if not len(MAGIC) <= footer.summary_start <= size - FOOTER_LENGTH:
+        return None
+    file.seek(footer.summary_start)
+    summary = file.read(size - FOOTER_LENGTH - footer.summary_start)
+    if footer.summary_crc not in (0, zlib.crc32(end[:CHECKED_FOOTER], zlib.crc32(summary))):
+        return None
+    return _from_summary(file, summary)
+
+
+def _from_summary(file: BinaryIO, summary: bytes) -> Layout | None:
+    layout = Layout(complete=True)
+    statistics: Statistics | None = None
+    indexes: list[ChunkIndex] = []
+    at = 0
+    while at < len(summary):
+        opcode, length = RECORD.unpack_from(summary, at)
+        body = summary[at + RECORD.size : at + RECORD.size + length]
+        at += RECORD.size + length
+        if opcode == Opcode.STATISTICS:
+            statistics = Statistics.read(_stream(body))
+        elif opcode == Opcode.CHUNK_INDEX:
+            indexes.append(ChunkIndex.read(_stream(body)))
+        elif opcode == Opcode.METADATA_INDEX:
+            index = MetadataIndex.read(_stream(body))
+            file.seek(index.offset + RECORD.size)
+            _note(layout, Opcode.METADATA, file.read(index.length - RECORD.size))
+        else:
+            layout.declared.note(opcode, body)
+    return None if statistics is None else _indexed(layout, statistics, indexes)
+
+
+def _indexed(layout: Layout, statistics: Statistics, indexes: list[ChunkIndex]) -> Layout | None:
+    """`layout` with the blocks and counts of a summary; None when it does not say which topics are where."""
+    channels = layout.declared.channels
+    in_chunks = len(indexes) == statistics.chunk_count and (indexes or not statistics.message_count)
+    if not in_chunks or not all(index.message_index_offsets for index in indexes):
+        return None
+    for index in sorted(indexes, key=lambda index: index.chunk_start_offset):
+        topics = frozenset(channels[number].topic for number in index.message_index_offsets)
+        layout.blocks.append(Block(index.chunk_start_offset, index.chunk_length, topics))
+    for number, count in statistics.channel_message_counts.items():
+        layout.counts[channels[number].topic] += count
+    return layout
+
+
+def _unpacked(raw: bytes) -> bytes:
+    """The records in a block, whose bytes are one chunk or bare messages."""
+    if raw[0] != Opcode.CHUNK:
+        return raw
+    stream, length = get_chunk_data_stream(Chunk.read(_stream(raw[RECORD.size :])), validate_crc=True)
+    return stream.read(length)
+
+
+def _stream(data: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(data))

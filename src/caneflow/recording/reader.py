@@ -1,0 +1,257 @@
+"""Reads a recording in the order of its stamps, in bounded memory; one that a kill cut short as well."""
+
+import heapq
+import json
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, NamedTuple, Self
+from weakref import WeakValueDictionary
+
+from mcap.records import Channel, Schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+
+from caneflow.messages import SAMPLES, Sample, stream_of
+from caneflow.recording.errors import RecordingError
+from caneflow.recording.layout import DAMAGE, MAGIC, Block, Content, Layout, content_of, layout_of
+
+EXPECTED = "a recording is an MCAP file as `caneflow run --record` writes it"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stream:
+    """What one node said on one port."""
+
+    key: str
+    node: str
+    port: str
+    schema: str  # its name, e.g. "caneflow.Imu/1"
+    count: int  # samples
+    first_stamp: int | None  # ns; None when there is no sample
+    last_stamp: int | None  # ns
+
+
+class Recorded(NamedTuple):
+    """One sample as it was recorded; whether its payload can be decoded is for the reader to find out."""
+
+    key: str
+    node: str
+    port: str
+    kind: type[Sample] | None  # None: a schema that this version of caneflow does not know
+    stamp: int  # ns, when the sensor measured
+    seq: int
+    log_time: int  # ns, when it was received
+    payload: bytes
+
+
+class Recording:
+    """A recording, open for reading; several iterations may be under way at a time, in one thread.
+
+    complete: False for a file whose writer was killed (or still writes); everything up to the cut is there.
+    metadata: flow, version, run, source.  rig: as it was recorded.
+    streams: by (node, port), in the order in which they were recorded first.
+    control: number of messages by key, of what the flow said about itself.
+
+    Raises RecordingError, here and in every method, for a file that is no recording or that is damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self._file = self.path.open("rb")
+        except OSError as error:
+            raise RecordingError(f"{self.path}: cannot be read: {error.strerror or error}") from error
+        try:
+            self._layout = _sound_layout(self.path, self._file)
+            self._contents: WeakValueDictionary[int, Content] = WeakValueDictionary()  # by offset of the block
+            self._lasts: dict[tuple[int, str], int] = {}  # by offset and key: the last stamp, ns
+            self.complete = self._layout.complete
+            self.metadata, self.rig = _about(self.path, self._layout)
+            self.streams, self.control = self._streams()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def flow(self) -> str:
+        """The name of the flow that was recorded."""
+        return self.metadata["flow"]
+
+    def span(self) -> tuple[int, int] | None:
+        """Stamps (ns) of the first and last sample of all streams; None when there is no sample."""
+        first = [stream.first_stamp for stream in self.streams.values() if stream.first_stamp is not None]
+        last = [stream.last_stamp for stream in self.streams.values() if stream.last_stamp is not None]
+        return (min(first), max(last)) if first else None
+
+    def samples(
+        self,
+        streams: Iterable[tuple[str, str]] | None = None,
+        *,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[Recorded]:
+        """Samples with start_ns <= stamp < end_ns: by stamp, then by the order of `streams`, then by seq.
+
+        Streams are (node, port); None means all. When a sample was received plays no part in the order.
+        Within one stream it is the file's, which is that of the stamps unless its producer broke the contract.
+        """
+        wanted = [self.stream(*name) for name in (self.streams if streams is None else streams)]
+        for stream in wanted:
+            self._require_samples(stream)
+        each = (self._samples_of(stream, start_ns, end_ns) for stream in wanted)
+        return heapq.merge(*each, key=attrgetter("stamp"))  # equal stamps: in the order of the arguments
+
+    def stream(self, node: str, port: str) -> Stream:
+        """The stream that `node` said on `port`; raises RecordingError, naming those there are."""
+        try:
+            return self.streams[node, port]
+        except KeyError:
+            there = ", ".join("/".join(name) for name in self.streams) or "none"
+            raise RecordingError(f"{self.path}: no stream {node}/{port}; there are {there}") from None
+
+    def close(self) -> None:
+        """Close the file; iterations under way end with an error."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _samples_of(self, stream: Stream, start: int | None, end: int | None) -> Iterator[Recorded]:
+        """The samples of one stream. Holds one block at a time, which is what bounds the memory."""
+        key, node, port, kind = stream.key, stream.node, stream.port, SAMPLES.get(stream.schema)
+        blocks = self._blocks(key)
+        if start is not None:
+            del blocks[: bisect_left(blocks, start, key=lambda block: self._last(block, key))]
+        for block in blocks:
+            content = self._content(block)
+            for stamp, seq, log_time, begin, finish in content.messages[key]:
+                if start is not None and stamp < start:
+                    continue
+                if end is not None and stamp >= end:
+                    return
+                yield Recorded(key, node, port, kind, stamp, seq, log_time, content.data[begin:finish])
+
+    def _blocks(self, key: str) -> list[Block]:
+        return [block for block in self._layout.blocks if key in block.topics]
+
+    def _content(self, block: Block) -> Content:
+        """The messages of `block`, unpacked once for all streams that are in it at a time."""
+        content = self._contents.get(block.offset)
+        if content is None:
+            try:
+                content = content_of(self._file, block, self._layout.declared)
+            except DAMAGE as error:
+                raise RecordingError(_damaged(self.path, block.offset)) from error
+            self._contents[block.offset] = content
+        return content
+
+    def _streams(self) -> tuple[dict[tuple[str, str], Stream], dict[str, int]]:
+        streams: dict[tuple[str, str], Stream] = {}
+        others: dict[str, int] = {}
+        for key, channel in self._topics().items():
+            try:
+                node, port = stream_of(key)
+            except ValueError:
+                others[key] = self._layout.counts[key]
+                continue
+            if (node, port) in streams:
+                raise RecordingError(
+                    f"{self.path}: both {streams[node, port].key} and {key} are in it; a recording is of one flow"
+                )
+            first, last = self._ends(key)
+            streams[node, port] = Stream(
+                key=key,
+                node=node,
+                port=port,
+                schema=self._schema(channel).name,
+                count=self._layout.counts[key],
+                first_stamp=first,
+                last_stamp=last,
+            )
+        return streams, others
+
+    def _topics(self) -> dict[str, Channel]:
+        """One channel for each topic, in the order of their numbers."""
+        topics: dict[str, Channel] = {}
+        for _, channel in sorted(self._layout.declared.channels.items()):
+            topics.setdefault(channel.topic, channel)
+        return topics
+
+    def _ends(self, key: str) -> tuple[int | None, int | None]:
+        blocks = self._blocks(key)
+        if not blocks:
+            return None, None
+        return self._content(blocks[0]).messages[key][0][0], self._last(blocks[-1], key)
+
+    def _last(self, block: Block, key: str) -> int:
+        """Stamp of the last sample of `key` in `block`, which is kept: a search looks at few blocks many times."""
+        at = block.offset, key
+        if at not in self._lasts:
+            messages = self._content(block).messages
+            self._lasts.update({(block.offset, topic): entries[-1][0] for topic, entries in messages.items()})
+        return self._lasts[at]
+
+    def _schema(self, channel: Channel) -> Schema:
+        nothing = Schema(id=0, name="", encoding="", data=b"")
+        return self._layout.declared.schemas.get(channel.schema_id, nothing)
+
+    def _require_samples(self, stream: Stream) -> None:
+        """Raise RecordingError unless the stream's channel says that it holds samples as caneflow sends them."""
+        channel = self._topics()[stream.key]
+        schema = self._schema(channel)
+        found = channel.message_encoding, schema.encoding
+        if found != (MessageEncoding.MessagePack, SchemaEncoding.JSONSchema):
+            raise RecordingError(
+                f"{self.path}: {stream.key} is {found[0] or 'of no encoding'} with "
+                f"{f'schema {schema.name} ({found[1]})' if schema.id else 'no schema'}; "
+                "a sample is msgpack with a schema such as caneflow.Imu/1 (jsonschema)"
+            )
+
+
+def _sound_layout(path: Path, file: BinaryIO) -> Layout:
+    require_mcap(path, file)
+    layout = layout_of(file)
+    if layout.damaged:
+        raise RecordingError(_damaged(path, layout.damaged[0]))
+    return layout
+
+
+def require_mcap(path: Path, file: BinaryIO) -> None:
+    """Raise RecordingError unless `file` starts as an MCAP file does."""
+    start = file.read(len(MAGIC))
+    if not start:
+        raise RecordingError(f"{path}: is empty; {EXPECTED}")
+    if start != MAGIC:
+        found = (
+            "was cut in its first bytes"
+            if MAGIC.startswith(start)
+            else f"is no MCAP file, it starts with {start!r}"
+        )
+        raise RecordingError(f"{path}: {found}; {EXPECTED}")
+
+
+def _about(path: Path, layout: Layout) -> tuple[dict[str, str], dict[str, Any]]:
+    """The metadata and the rig."""
+    for name, key in (("caneflow", "flow"), ("rig", "json")):
+        if key not in layout.metadata.get(name, {}):
+            cut = "" if layout.complete else ", it was cut before there was any"
+            raise RecordingError(f"{path}: has no metadata record {name!r} with {key!r}{cut}; {EXPECTED}")
+    try:
+        rig = json.loads(layout.metadata["rig"]["json"])
+    except ValueError as error:
+        raise RecordingError(f"{path}: the rig in it is no JSON: {error}") from error
+    if not isinstance(rig, dict):
+        raise RecordingError(f"{path}: the rig in it is {rig!r}; it is a map")
+    return layout.metadata["caneflow"], rig
+
+
+def _damaged(path: Path, offset: int) -> str:
+    return f"{path}: damaged at byte {offset}; `caneflow recover {path}` saves the rest"

@@ -1,0 +1,80 @@
+"""Zenoh sessions with explicit links: no discovery, one dialling side per edge, nothing beyond what is written.
+
+The defaults of Zenoh lose data silently: peers do not relay for peers, a lost link is dialled again after up to
+4 s, a frozen peer is noticed after 10 s, and a put that blocks gives up after 5 s and closes the link.
+"""
+
+import json
+import random
+import socket
+from collections.abc import Sequence
+
+import zenoh
+
+from caneflow.runtime.errors import DataflowError
+
+LIVE_LEASE = 1_000  # ms until a frozen peer is given up
+REPLAY_LEASE = 60_000  # ms: a replay waits for a reader that stalls, it does not lose it
+WAIT_BEFORE_CLOSE = 600_000_000  # us that a blocking put waits before the link is closed
+RETRY = {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2}
+PORTS = range(20_000, 32_000)  # below Linux's ephemeral ports, so that no outgoing connection takes one
+
+
+def open_session(
+    *, mode: str = "peer", listen: Sequence[str] = (), connect: Sequence[str] = (), replay: bool = False
+) -> zenoh.Session:
+    """A session on exactly these endpoints; raises DataflowError when it cannot be opened."""
+    zenoh.init_log_from_env_or("error")
+    settings = {
+        "mode": mode,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/retry": RETRY,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "open/return_conditions/connect_scouted": False,
+        "transport/link/tx/lease": REPLAY_LEASE if replay else LIVE_LEASE,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        where = ", ".join((*listen, *connect))
+        raise DataflowError(f"no Zenoh session on {where}: {error}") from error
+
+
+class Ports:
+    """Loopback ports for the processes of one run, free now and reserved among the flows of this machine."""
+
+    def __init__(self) -> None:
+        self._reservations: list[socket.socket] = []
+
+    def endpoint(self) -> str:
+        """A loopback endpoint that nobody listens on."""
+        for port in random.sample(PORTS, k=200):  # spreads flows over the ports; nothing secret
+            if self._reserve(port):
+                return f"tcp/127.0.0.1:{port}"
+        raise DataflowError(f"no free port on 127.0.0.1 within {PORTS.start}..{PORTS.stop - 1}")
+
+    def release(self) -> None:
+        """Give the reservations back."""
+        for reservation in self._reservations:
+            reservation.close()
+        self._reservations.clear()
+
+    def _reserve(self, port: int) -> bool:
+        # An abstract Unix socket is a lock that the kernel drops when this process dies, however it dies.
+        reservation = socket.socket(socket.AF_UNIX)
+        try:
+            reservation.bind(f"\0caneflow-port-{port}")
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(("127.0.0.1", port))
+        except OSError:
+            reservation.close()
+            return False
+        self._reservations.append(reservation)
+        return True

@@ -1,0 +1,93 @@
+"""Several streams in one order that depends on their stamps alone, never on when they happened to arrive.
+
+A sample is handed on only when every other stream is known to have passed it: its watermark w promises that no
+sample with a stamp <= w will come any more. So the order (stamp, port order, seq) is the same in every run.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+
+from caneflow.messages import Sample
+
+BEGIN = -1  # the watermark of a stream that has said nothing
+END = 2**63 - 1  # the watermark of a stream that will say nothing more
+
+
+class Merge:
+    """The samples of a node's input ports, handed on in event time."""
+
+    def __init__(self, ports: Sequence[str]) -> None:
+        self.ports = tuple(ports)
+        self._queues: list[deque[Sample]] = [deque() for _ in ports]
+        self._watermarks = [BEGIN for _ in ports]
+        self._index = {port: i for i, port in enumerate(ports)}
+
+    def push(self, port: str, message: Sample) -> None:
+        """Add a sample; stamps strictly increase per port, and lie beyond the port's watermark."""
+        i = self._index[port]
+        self._queues[i].append(message)
+        self._watermarks[i] = message.stamp
+
+    def advance(self, port: str, watermark: int) -> None:
+        """Note that no sample with a stamp <= `watermark` (ns) will come on `port`."""
+        i = self._index[port]
+        self._watermarks[i] = max(self._watermarks[i], watermark)
+
+    def watermark(self, port: str) -> int:
+        """Up to which stamp (ns) everything of `port` has come."""
+        return self._watermarks[self._index[port]]
+
+    def waiting(self, port: str) -> int:
+        """How many samples of `port` wait."""
+        return len(self._queues[self._index[port]])
+
+    def drop_oldest(self, port: str) -> None:
+        """Forget the oldest waiting sample of `port`."""
+        self._queues[self._index[port]].popleft()
+
+    def pop(self) -> tuple[str, Sample] | None:
+        """The next sample in event time, or None while another stream may still come before it."""
+        first = self._first()
+        if first is None or self._holding(first) is not None:
+            return None
+        return self.ports[first], self._queues[first].popleft()
+
+    def held_by(self) -> str | None:
+        """The port that the next sample waits for, if one waits at all."""
+        first = self._first()
+        holding = None if first is None else self._holding(first)
+        return None if holding is None else self.ports[holding]
+
+    def go_on_without(self, port: str) -> None:
+        """Stop waiting for `port` at the next sample: what it still brings before that is late."""
+        first = self._first()
+        if first is not None:
+            i = self._index[port]
+            self._watermarks[i] = max(self._watermarks[i], self._needed(first, i))
+
+    def handled(self) -> int:
+        """Up to which stamp (ns) everything has come and has been handed on."""
+        return min(
+            (queue[0].stamp - 1 if queue else mark)
+            for queue, mark in zip(self._queues, self._watermarks, strict=True)
+        )
+
+    def _first(self) -> int | None:
+        """The index of the port whose oldest sample is next by (stamp, port order)."""
+        first = None
+        for i, queue in enumerate(self._queues):
+            if queue and (first is None or queue[0].stamp < self._queues[first][0].stamp):
+                first = i
+        return first
+
+    def _holding(self, first: int) -> int | None:
+        """The index of a port that may still bring a sample before the first one of port `first`."""
+        for i, queue in enumerate(self._queues):
+            if not queue and self._watermarks[i] < self._needed(first, i):
+                return i
+        return None
+
+    def _needed(self, first: int, other: int) -> int:
+        """The watermark that port `other` must have passed before the first sample of port `first` may go."""
+        stamp = self._queues[first][0].stamp
+        return stamp if other < first else stamp - 1

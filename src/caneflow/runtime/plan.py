@@ -1,0 +1,75 @@
+"""What one node needs to know to run, wherever it runs: written by the launcher, read by the node's process."""
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caneflow.messages import SAMPLES, Sample
+from caneflow.runtime.errors import DataflowError
+
+
+class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
+    """One input port."""
+
+    key: str
+    schema: str  # of the port's type, e.g. "caneflow.Imu/1"
+    writer: str  # the node at the other end
+    length: int | None = None  # how many samples may wait; the oldest is dropped beyond. None: all
+    max_lag_ms: float | None = None  # live: how long the graph waits for this input. None: for ever
+    max_age_ms: float | None = None  # live: older samples are dropped. None: never
+
+    @cached_property
+    def kind(self) -> type[Sample]:
+        """The type that the port takes."""
+        return SAMPLES[self.schema]
+
+
+class OutputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
+    """One output port."""
+
+    key: str
+    schema: str
+
+    @cached_property
+    def kind(self) -> type[Sample]:
+        """The type that the port gives."""
+        return SAMPLES[self.schema]
+
+
+class Links(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a node listens and whom it dials; exactly one side of every edge dials (readers dial writers)."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+
+
+class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
+    """One node of a run."""
+
+    flow: str
+    node: str
+    module: str | None = None  # `python -m` name of the program
+    file: str | None = None  # or a user's own file
+    settings: dict[str, Any] = {}
+    rig: dict[str, Any] = {}
+    seed: int = 0
+    replay: bool = False  # sources are recordings: nothing may be lost, everybody waits
+    inputs: dict[str, InputPlan] = {}
+    outputs: dict[str, OutputPlan] = {}
+    readers: tuple[str, ...] = ()  # the nodes that read an output, the recorder among them
+    links: Links = Links()
+    ready_timeout_s: float = 20.0
+
+    def write(self, path: Path) -> None:
+        """Store the plan for the node's process."""
+        path.write_bytes(msgspec.json.encode(self))
+
+    @classmethod
+    def read(cls, path: Path) -> "NodePlan":
+        """The plan in `path`; raises DataflowError when there is none."""
+        try:
+            return msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError) as error:
+            raise DataflowError(f"{path}: {error}; a node is started by `caneflow run`") from error

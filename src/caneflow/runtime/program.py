@@ -1,0 +1,121 @@
+"""What a node runs: an Operator turns messages into messages, a Source brings them in.
+
+Neither owns a socket or a thread, and an operator owns no clock: time is `message.stamp`. So any host can run
+the very same class.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, TypeAlias
+
+import numpy as np
+
+from caneflow.errors import CaneflowError
+from caneflow.messages import Sample
+from caneflow.messages.rig import Rig
+
+Brought: TypeAlias = "Generator[tuple[str, Sample | Encoded] | Quiet, None, None]"
+Emitted: TypeAlias = Iterable[tuple[str, Sample]]  # (output port, message), in the order in which they leave
+
+ANY_PORT = "*"  # in `inputs`: every port that is not named takes this type
+
+
+class Refused(CaneflowError):
+    """Raised by `handle` for a message that is well-formed but of no use: counted, named once, life goes on."""
+
+
+class Encoded(NamedTuple):
+    """A sample that has its bytes already, as a recording holds it."""
+
+    kind: type[Sample]
+    stamp: int  # ns
+    seq: int
+    payload: bytes
+
+
+class Quiet(NamedTuple):
+    """Said by a source instead of a sample: none with a stamp at or before `until` (ns) will come."""
+
+    until: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoSettings:
+    """For a program that has nothing to set."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Context:
+    """What a host hands to a program besides its settings."""
+
+    node: str  # its name in the graph
+    rig: Rig
+    ports: Mapping[str, type[Sample]]  # what the graph wires to it (operator, sink: inputs; source: outputs)
+    random: np.random.Generator  # from the graph's seed and the node's name: other nodes do not change it
+
+
+class Operator(ABC):
+    """Messages in, messages out, in event time: no socket, no thread, no clock."""
+
+    inputs: ClassVar[Mapping[str, type[Sample]]] = {}
+    outputs: ClassVar[Mapping[str, type[Sample]]] = {}
+    optional_inputs: ClassVar[frozenset[str]] = frozenset()  # ports that a graph may leave open
+    Settings: ClassVar[type[Any]] = NoSettings  # a frozen dataclass or pydantic model
+
+    @abstractmethod
+    def __init__(self, settings: Any, context: Context) -> None: ...
+
+    @abstractmethod
+    def handle(self, port: str, message: Sample) -> Emitted:
+        """Yield what follows from `message`.
+
+        Messages come by (stamp, port order, seq), each once. What is yielded carries the stamp of the
+        measurement that caused it; stamps of one output port strictly increase.
+        """
+
+    def finish(self) -> Emitted:
+        """Yield what is left when every input has ended."""
+        return ()
+
+
+class Source(ABC):
+    """Samples out of the world: a device or a recording."""
+
+    outputs: ClassVar[Mapping[str, type[Sample]]] = {}
+    ordered: ClassVar[bool] = False  # stamps increase over all ports together, not only on each
+    Settings: ClassVar[type[Any]] = NoSettings
+
+    @abstractmethod
+    def __init__(self, settings: Any, context: Context) -> None: ...
+
+    @abstractmethod
+    def samples(self) -> Brought:
+        """Yield (output port, sample) as they come, each stamped when it was taken; block while there is none.
+
+        Closed (GeneratorExit at the yield) when the flow ends: put what must be stopped into `finally`.
+        """
+
+
+class Sink(ABC):
+    """Takes every sample of many streams as it comes, out of event time: a recorder, a view."""
+
+    Settings: ClassVar[type[Any]] = NoSettings
+
+    @abstractmethod
+    def __init__(self, settings: Any, context: Context) -> None: ...
+
+    @abstractmethod
+    def take(self, key: str, message: Sample, payload: bytes, time: int) -> None:
+        """Take one sample, with its bytes as sent and the time of reception (ns)."""
+
+    @abstractmethod
+    def idle(self, time: int) -> None:
+        """Called when nothing has come for a while, with the time (ns)."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Called once, when every stream has ended or the flow is stopped."""
+
+
+Program: TypeAlias = type[Operator] | type[Source] | type[Sink]

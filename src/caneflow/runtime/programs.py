@@ -1,0 +1,190 @@
+"""From what `run:` says to the class that runs: modules of caneflow, and users' own files."""
+
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+import re
+import sys
+import traceback
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any, NamedTuple
+
+from caneflow.messages import NAME, NAME_RULE, Sample
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.program import ANY_PORT, Operator, Program, Sink, Source
+from caneflow.runtime.validation import Checked, Mistake
+from caneflow.runtime.wording import did_you_mean, dotted, listed, one_line, shown
+
+ROOMS = ("drivers", "operators")
+IN_A_ROOM = re.compile(rf"({'|'.join(ROOMS)})\.[A-Za-z_][A-Za-z0-9_]*")
+FILES_NAMED = 8  # of a folder without the file that was asked for
+
+
+class Located(NamedTuple):
+    """Where a program is: a module for `python -m`, or a file."""
+
+    module: str | None = None
+    file: Path | None = None
+
+
+def locate(run: str, base: Path) -> Located:
+    """Where the program `run` is; a path is taken from the folder `base`. Raises DataflowError if there is none."""
+    if "/" in run or run.endswith(".py"):
+        return Located(file=_file(run, base))
+    if IN_A_ROOM.fullmatch(run) and importlib.util.find_spec(f"caneflow.{run}") is not None:
+        return Located(module=f"caneflow.{run}")
+    there = available()
+    raise DataflowError(
+        f"no program {shown(run)} in {_looked_in()};{did_you_mean(run, there)} there are {listed(there)}; "
+        "a program of your own is named by the path to its .py file"
+    )
+
+
+def available() -> list[str]:
+    """What `run` may name without a path."""
+    return [f"{room}.{module.name}" for room in ROOMS for module in pkgutil.iter_modules(_room(room).__path__)]
+
+
+def load_program(run: str, base: Path) -> Program:
+    """The one program class in what `run` names; raises DataflowError when it cannot be had."""
+    where = locate(run, base)
+    module = _imported(where)
+    programs = [
+        value
+        for value in vars(module).values()
+        if inspect.isclass(value)
+        and issubclass(value, (Operator, Source, Sink))
+        and value.__module__ == module.__name__
+    ]
+    complete = [program for program in dict.fromkeys(programs) if not inspect.isabstract(program)]
+    if len(complete) > 1:
+        names = listed(program.__name__ for program in complete)
+        raise DataflowError(f"{shown(run)} holds several programs: {names}; one file holds one")
+    if not complete:
+        raise DataflowError(_none_in(run, programs))
+    _check_tables(run, complete[0])
+    return complete[0]
+
+
+def inputs_of(program: Program) -> Mapping[str, type[Sample]]:
+    """The input ports of a program and their types; `*` stands for every port that is not named."""
+    if issubclass(program, Operator):
+        return program.inputs
+    return {ANY_PORT: Sample} if issubclass(program, Sink) else {}
+
+
+def outputs_of(program: Program) -> Mapping[str, type[Sample]]:
+    """The output ports of a program and their types."""
+    return {} if issubclass(program, Sink) else program.outputs
+
+
+def validated_settings(program: Program, settings: Mapping[str, Any]) -> Any:
+    """`settings` as the program's Settings; raises DataflowError, one line for each mistake."""
+    made, mistakes = check_settings(program, settings)
+    if mistakes:
+        lines = (": ".join(filter(None, (dotted(("settings", *m.path)), m.text))) for m in mistakes)
+        raise DataflowError("\n".join(lines))
+    return made
+
+
+def check_settings(program: Program, settings: Mapping[str, Any]) -> tuple[Any, list[Mistake]]:
+    """`settings` as the program's Settings, or None and what is wrong with them."""
+    checked: Checked[Any] = Checked(program.Settings)
+    try:
+        return checked(settings)
+    except Exception as error:  # a check of its own that breaks: users' code may raise anything
+        return None, [Mistake((), f"{program.Settings.__qualname__} breaks on these: {_cause(error)}")]
+
+
+class _Fresh(SourceFileLoader):
+    """Compiles the file each time: what is cached may be older than an edit within the same second."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
+def _file(run: str, base: Path) -> Path:
+    file = base / Path(run)
+    try:
+        if file.is_file() and file.suffix == ".py":
+            return file.resolve()
+        folder = file.parent
+        there = sorted(f"{Path(run).parent / found.name}" for found in folder.glob("*.py"))[:FILES_NAMED]
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise DataflowError(f"no Python file {shown(run)}: {one_line(error)}") from error
+    raise DataflowError(f"no Python file {shown(str(file))};{did_you_mean(run, there)} there are {listed(there)}")
+
+
+def _room(room: str) -> ModuleType:
+    return importlib.import_module(f"caneflow.{room}")
+
+
+def _looked_in() -> str:
+    return listed(str(Path(path)) for room in ROOMS for path in _room(room).__path__)
+
+
+def _imported(where: Located) -> ModuleType:
+    name = where.module or str(where.file)
+    try:
+        with redirect_stdout(sys.stderr):  # what a program prints is no answer of ours
+            return importlib.import_module(where.module) if where.module else _from_file(where.file)
+    except (Exception, SystemExit) as error:  # a program may do anything while it is imported
+        raise DataflowError(f"{name} cannot be imported: {_cause(error)}") from error
+
+
+def _from_file(file: Path) -> ModuleType:
+    """The module in a user's file, made anew; its neighbours can be imported from it, as when it is run."""
+    name = f"caneflow_user_{abs(hash(str(file))):x}_{file.stem}"
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))
+    spec = importlib.util.spec_from_file_location(name, file, loader=_Fresh(name, str(file)))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # annotations are looked up there
+    spec.loader.exec_module(module)
+    return module
+
+
+def _cause(error: BaseException) -> str:
+    """The error and the line of users' code that raised it."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]
+    where = f" (line {frames[-1].lineno} of {frames[-1].filename})" if frames else ""
+    if isinstance(error, SyntaxError):
+        where = f" (line {error.lineno} of {error.filename})"
+        error_text = error.msg
+    else:
+        error_text = one_line(error)
+    return f"{type(error).__name__}: {error_text}{where}"
+
+
+def _none_in(run: str, unfinished: list[Program]) -> str:
+    if not unfinished:
+        return f"{shown(run)} holds no program; that is a class derived from Operator, Source or Sink"
+    program = unfinished[0]
+    missing = listed(sorted(program.__abstractmethods__))
+    return f"{shown(run)}: {program.__name__} does not define {missing}"
+
+
+def _check_tables(run: str, program: Program) -> None:
+    """Raise DataflowError unless ports and Settings of the class are what the runtime works with."""
+    for table, ports in (("inputs", inputs_of(program)), ("outputs", outputs_of(program))):
+        where = f"{shown(run)}: {program.__name__}.{table}"
+        if not isinstance(ports, Mapping):
+            raise DataflowError(f"{where} is no table of ports; that is e.g. {{'imu': Imu}}")
+        for port, kind in ports.items():
+            if not (isinstance(port, str) and (NAME.fullmatch(port) or port == ANY_PORT)):
+                raise DataflowError(f"{where}: {shown(port)} is no name of a port; that is {NAME_RULE}")
+            if not (inspect.isclass(kind) and issubclass(kind, Sample)):
+                raise DataflowError(f"{where}[{shown(port)}] is {shown(kind)}; it takes a class of messages")
+    try:
+        Checked(program.Settings)
+    except Exception as error:  # pydantic has a dozen ways to say that it cannot check a type
+        raise DataflowError(
+            f"{shown(run)}: {program.__name__}.Settings cannot be checked: {one_line(error)}"
+        ) from error

@@ -1,0 +1,133 @@
+"""One operator with its inputs and outputs, on no host in particular: what both hosts do the same way.
+
+Samples come in as they arrive and are checked against their stream; the operator gets them in event time; what it
+emits is numbered. Nothing here knows Zenoh, processes or a clock.
+"""
+
+from collections.abc import Iterator, Mapping
+
+from caneflow.messages import MessageError, Sample
+from caneflow.messages.control import InputCounts, PortMark, Progress
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.merge import END, Merge
+from caneflow.runtime.plan import InputPlan, OutputPlan
+from caneflow.runtime.program import Emitted, Operator, Refused
+from caneflow.runtime.streams import Arrivals, Departures
+
+
+class Stage:
+    """An operator between its input and output streams."""
+
+    def __init__(
+        self, node: str, operator: Operator, inputs: Mapping[str, InputPlan], outputs: Mapping[str, OutputPlan]
+    ) -> None:
+        self.node = node
+        self.inputs = {port: Arrivals(plan) for port, plan in inputs.items()}
+        self.outputs = {port: Departures(plan) for port, plan in outputs.items()}
+        self.finished = False
+        self._operator = operator
+        self._merge = Merge(tuple(inputs))
+
+    def offer(self, port: str, message: Sample) -> None:
+        """Take a decoded sample that arrived on `port`."""
+        arrivals = self.inputs[port]
+        arrivals.counts.received += 1
+        if not arrivals.admit(message):
+            return
+        if message.stamp <= self._merge.watermark(port):
+            arrivals.counts.late += 1
+        else:
+            self._merge.push(port, message)
+            self._keep_length(port, arrivals)
+        self._count_mark(port, arrivals)
+
+    def refuse(self, port: str, error: MessageError) -> None:
+        """Count a sample on `port` that could not be decoded."""
+        self.inputs[port].refuse_unreadable(error)
+        self._count_mark(port, self.inputs[port])
+
+    def give_up(self, port: str) -> None:
+        """Stop waiting for samples of `port` that were sent and did not arrive."""
+        self.inputs[port].give_up()
+        self._count_mark(port, self.inputs[port])
+
+    def mark(self, port: str, mark: PortMark) -> None:
+        """Take the writer's word on how far the stream of `port` has come."""
+        arrivals = self.inputs[port]
+        arrivals.mark = mark
+        self._count_mark(port, arrivals)
+
+    def close(self, port: str) -> None:
+        """Note that nothing more will come on `port`, whatever its writer said."""
+        self._merge.advance(port, END)
+
+    def go_on_without(self, port: str) -> None:
+        """Stop waiting for `port` at the sample that waits for it."""
+        self._merge.go_on_without(port)
+
+    def held_by(self) -> str | None:
+        """The port that the next sample waits for."""
+        return self._merge.held_by()
+
+    def step(self, now: int | None = None) -> Iterator[tuple[str, Sample, int]] | None:
+        """Handle the next sample in event time: what follows, as (port, message, seq). None: nothing is due.
+
+        `now` (ns) is the host's clock, given by a live host only: inputs may have a greatest age.
+        """
+        due = self._merge.pop()
+        if due is not None:
+            port, message = due
+            arrivals = self.inputs[port]
+            if now is not None and arrivals.too_old(message, now):
+                arrivals.counts.dropped += 1
+                return iter(())
+            arrivals.counts.handled += 1
+            return self._numbered(self._handled(port, message))
+        if not self.finished and self._merge.handled() == END:
+            self.finished = True
+            return self._numbered(self._operator.finish())
+        return None
+
+    def progress(self) -> Progress:
+        """How far the node has come: what is handled can cause no further output."""
+        handled = END if self.finished else min(self._merge.handled(), END - 1)
+        marks = {port: PortMark(out.sent - 1, handled) for port, out in self.outputs.items()}
+        return Progress(self.node, handled, marks)
+
+    def tells_more_than_samples(self) -> bool:
+        """Whether a reader cannot see from the samples alone how far this node has come."""
+        handled = self._merge.handled()
+        return any(out.last_stamp < handled for out in self.outputs.values())
+
+    def input_counts(self) -> dict[str, InputCounts]:
+        """What became of every sample that came, per port."""
+        for port, arrivals in self.inputs.items():
+            arrivals.counts.waiting = self._merge.waiting(port)
+        return {port: arrivals.counts for port, arrivals in self.inputs.items()}
+
+    def _handled(self, port: str, message: Sample) -> Emitted:
+        try:
+            yield from self._operator.handle(port, message)
+        except Refused as refused:
+            self.inputs[port].counts.handled -= 1
+            self.inputs[port].refuse(refused)
+
+    def _numbered(self, emitted: Emitted) -> Iterator[tuple[str, Sample, int]]:
+        for port, message in emitted:
+            departures = self.outputs.get(port)
+            if departures is None:
+                raise DataflowError(
+                    f"{self.node}: emitted on port {port!r}; it has {', '.join(self.outputs) or 'none'}"
+                )
+            yield port, message, departures.number(message)
+
+    def _keep_length(self, port: str, arrivals: Arrivals) -> None:
+        length = arrivals.plan.length
+        while length is not None and self._merge.waiting(port) > length:
+            self._merge.drop_oldest(port)
+            arrivals.counts.dropped += 1
+
+    def _count_mark(self, port: str, arrivals: Arrivals) -> None:
+        watermark = arrivals.arrived_mark()
+        if watermark is not None:
+            self._merge.advance(port, watermark)

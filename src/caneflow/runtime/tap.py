@@ -1,0 +1,83 @@
+"""One sink with its inputs: every sample is handed on as it comes, checked against its stream."""
+
+from collections.abc import Mapping
+
+from caneflow.messages import MessageError, Sample
+from caneflow.messages.control import InputCounts, PortMark, Progress
+from caneflow.runtime.merge import BEGIN, END
+from caneflow.runtime.plan import InputPlan
+from caneflow.runtime.program import Sink
+from caneflow.runtime.streams import Arrivals
+
+
+class Tap:
+    """A sink at the end of its streams."""
+
+    def __init__(self, node: str, sink: Sink, inputs: Mapping[str, InputPlan]) -> None:
+        self.node = node
+        self.inputs = {port: Arrivals(plan) for port, plan in inputs.items()}
+        self.finished = False
+        self._sink = sink
+        self._watermarks = {port: BEGIN for port in inputs}
+
+    def offer(self, port: str, message: Sample, payload: bytes, time: int) -> None:
+        """Take a decoded sample that arrived on `port` at `time` (ns)."""
+        arrivals = self.inputs[port]
+        arrivals.counts.received += 1
+        if arrivals.admit(message):
+            arrivals.counts.handled += 1
+            self._sink.take(arrivals.plan.key, message, payload, time)
+            self._advance(port, message.stamp)
+        self._count_mark(port)
+
+    def refuse(self, port: str, error: MessageError) -> None:
+        """Count a sample on `port` that could not be decoded."""
+        self.inputs[port].refuse_unreadable(error)
+        self._count_mark(port)
+
+    def mark(self, port: str, mark: PortMark) -> None:
+        """Take the writer's word on how far the stream of `port` has come."""
+        self.inputs[port].mark = mark
+        self._count_mark(port)
+
+    def give_up(self, port: str) -> None:
+        """Stop waiting for samples of `port` that were sent and did not arrive."""
+        self.inputs[port].give_up()
+        self._count_mark(port)
+
+    def close(self, port: str) -> None:
+        """Note that nothing more will come on `port`."""
+        self._advance(port, END)
+
+    def idle(self, time: int) -> None:
+        """Give the sink a moment when nothing comes."""
+        if not self.finished:
+            self._sink.idle(time)
+
+    def finish(self) -> None:
+        """End the sink, once."""
+        if not self.finished:
+            self.finished = True
+            self._sink.finish()
+
+    @property
+    def ended(self) -> bool:
+        """Whether every stream has ended."""
+        return min(self._watermarks.values()) == END
+
+    def progress(self) -> Progress:
+        """How far every stream has been taken."""
+        taken = min(self._watermarks.values())
+        return Progress(self.node, END if self.finished else min(taken, END - 1), {})
+
+    def input_counts(self) -> dict[str, InputCounts]:
+        """What became of every sample that came, per port."""
+        return {port: arrivals.counts for port, arrivals in self.inputs.items()}
+
+    def _count_mark(self, port: str) -> None:
+        watermark = self.inputs[port].arrived_mark()
+        if watermark is not None:
+            self._advance(port, watermark)
+
+    def _advance(self, port: str, watermark: int) -> None:
+        self._watermarks[port] = max(self._watermarks[port], watermark)

@@ -1,0 +1,39 @@
+"""How values, paths and choices are put into one line of a message."""
+
+import json
+import re
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import TypeAlias
+
+KeyPath: TypeAlias = tuple[str | int, ...]  # the way to a value: keys of mappings, numbers in lists
+
+LONGEST = 60  # characters of a value that are worth a look
+PLAIN_KEY = re.compile(r"[\w*-]+")
+
+
+def shown(value: object) -> str:
+    """`value` as the file might spell it, on one line and not too long."""
+    text = repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=repr)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def dotted(path: KeyPath) -> str:
+    """`path` in one word, e.g. `nodes.fusion.settings.poles.0`."""
+    return ".".join(str(key) if PLAIN_KEY.fullmatch(str(key)) else shown(key) for key in path)
+
+
+def one_line(text: object) -> str:
+    """`text` with every run of white space, line ends among them, made one space."""
+    return " ".join(str(text).split())
+
+
+def listed(names: Iterable[str]) -> str:
+    """`names` as a list to read, or the word for none."""
+    return ", ".join(names) or "none"
+
+
+def did_you_mean(word: str, names: Iterable[str]) -> str:
+    """` did you mean 'x'?` for the closest of `names`, or nothing when none is close."""
+    close = get_close_matches(word, list(names), n=1)
+    return f" did you mean {close[0]!r}?" if close else ""

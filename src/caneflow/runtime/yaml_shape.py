@@ -1,0 +1,218 @@
+"""What may be written in a dataflow.yaml, and in which form: its keys, their types, their defaults.
+
+The semantic checks (wires, programs, machines) come after it, and take what this leaves standing: a value that is
+wrong here is reported and then treated as not written.
+"""
+
+import copy
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+
+from caneflow.messages import NAME, NAME_RULE
+from caneflow.messages.rig import Rig
+from caneflow.runtime.validation import Checked, Mistake
+from caneflow.runtime.wording import KeyPath
+
+NAME_PATTERN = f"^{NAME.pattern}$"
+STREAM_PATTERN = f"^{NAME.pattern}/{NAME.pattern}$"
+QUEUE_PATTERN = "^(latest|all|fifo [1-9][0-9]{0,5})$"
+ENDPOINT_PATTERN = r"^(tcp|tls|quic|ws)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}$"
+
+ALL_LENGTH = 4096  # samples that may wait on an input that takes `all`: 40 s at 100 Hz
+
+Policy = Literal["never", "on-failure", "always"]
+
+Name = Annotated[str, Field(pattern=NAME_PATTERN, description=NAME_RULE)]
+Stream = Annotated[str, Field(pattern=STREAM_PATTERN, examples=["radar/frame"])]
+Endpoint = Annotated[str, Field(pattern=ENDPOINT_PATTERN, examples=["tcp/0.0.0.0:7447"])]
+
+
+class Shape(BaseModel):
+    """A mapping of the file: nothing in it that is not listed here."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class InputShape(Shape):
+    """One input of a node, where more is to be said than `port: node/output`."""
+
+    source: Annotated[
+        str,
+        Field(alias="from", pattern=STREAM_PATTERN, examples=["radar/frame"], description="node and output"),
+    ]
+    queue: Annotated[
+        str,
+        Field(
+            pattern=QUEUE_PATTERN,
+            examples=["latest", "fifo 10", "all"],
+            description=f"live: which samples wait. `latest`: the newest one; `fifo N`: the newest N; "
+            f"`all`: every one, up to {ALL_LENGTH}. The oldest is dropped and counted beyond that",
+        ),
+    ] = "all"
+    max_lag_ms: Annotated[
+        float | None,
+        Field(ge=0, description="ms, live: how long the node waits for this input; left out: for ever"),
+    ] = None
+    max_age_ms: Annotated[
+        float | None, Field(gt=0, description="ms, live: an older sample is dropped; left out: none is")
+    ] = None
+
+
+class RestartShape(Shape):
+    """What becomes of a node whose process ends."""
+
+    policy: Annotated[
+        Policy, Field(description="start it again never, when it failed, or whenever it has ended")
+    ] = "on-failure"
+    max_restarts: Annotated[
+        int, Field(ge=1, le=1000, description="restarts within `window_s` until it is given up")
+    ] = 10
+    window_s: Annotated[float, Field(gt=0, le=86400, description="s")] = 60.0
+    delay_s: Annotated[
+        float, Field(ge=0, le=3600, description="s before the first restart; doubles with each one in the window")
+    ] = 0.25
+    max_delay_s: Annotated[float, Field(gt=0, le=3600, description="s; the delay grows no further")] = 10.0
+
+
+class MachineShape(Shape):
+    """One computer: where it is reached, and whom it dials."""
+
+    listen: Annotated[list[Endpoint], Field(description="where other machines reach it")] = []
+    connect: Annotated[
+        list[Endpoint], Field(description="whom it dials: for each pair of machines, one of the two does")
+    ] = []
+
+
+def _expanded_input(written: object) -> object:
+    return {"from": written} if isinstance(written, str) else written
+
+
+def _expanded_restart(written: object) -> object:
+    return {"policy": written} if isinstance(written, str) else written
+
+
+def _short_or(short: dict[str, Any], long: type[Shape], description: str) -> WithJsonSchema:
+    schema = long.model_json_schema()
+    return WithJsonSchema({"anyOf": [short, schema], "description": description})
+
+
+Input = Annotated[
+    InputShape,
+    BeforeValidator(_expanded_input),
+    _short_or(
+        {"type": "string", "pattern": STREAM_PATTERN, "examples": ["radar/frame"]},
+        InputShape,
+        "node/output, or a mapping that says more",
+    ),
+]
+Restart = Annotated[
+    RestartShape,
+    BeforeValidator(_expanded_restart),
+    _short_or(
+        {"type": "string", "enum": ["never", "on-failure", "always"]},
+        RestartShape,
+        "what becomes of the node when its process ends; a mapping says how often and how fast",
+    ),
+]
+
+
+class NodeShape(Shape):
+    """One node: a program and how it is wired."""
+
+    run: Annotated[
+        str,
+        Field(
+            default_factory=str,
+            examples=["drivers.bno055", "operators.fusion", "my/own.py"],
+            description="the program: a module of caneflow, or a path (from this file) to a Python file",
+        ),
+    ]
+    machine: Annotated[Name | None, Field(description="one of `machines`; needed when there are several")] = None
+    inputs: Annotated[dict[Name, Input], Field(description="for each port of the program, what it reads")] = {}
+    settings: Annotated[dict[str, Any], Field(description="the program's own; see its Settings")] = {}
+    restart: Annotated[Restart, Field(default_factory=RestartShape)]
+    external: Annotated[
+        bool, Field(description="a device that publishes by itself: it has `outputs`, and no program")
+    ] = False
+    outputs: Annotated[
+        dict[Name, str],
+        Field(description="external only: for each port, the message it sends, e.g. `Imu` or `caneflow.Imu/1`"),
+    ] = {}
+    ready_timeout_s: Annotated[
+        float, Field(gt=0, le=3600, description="s from its start within which the node says that it is ready")
+    ] = 20.0
+
+
+class FlowShape(Shape):
+    """A dataflow.yaml."""
+
+    model_config = ConfigDict(title="caneflow dataflow", json_schema_extra={"required": ["flow", "nodes"]})
+
+    flow: Annotated[
+        str,
+        Field(
+            default_factory=str,
+            pattern=NAME_PATTERN,
+            examples=["cane"],
+            description=f"first part of every key: {NAME_RULE}",
+        ),
+    ]
+    seed: Annotated[
+        int, Field(ge=0, le=2**63 - 1, description="where all random numbers of the flow come from")
+    ] = 0
+    rig: Annotated[Rig, Field(default_factory=Rig, description="what is bolted on")]
+    machines: Annotated[
+        dict[Name, MachineShape], Field(description="when the flow runs on several computers")
+    ] = {}
+    nodes: Annotated[
+        dict[Name, NodeShape], Field(default_factory=dict, description="the programs and their wires")
+    ]
+    results: Annotated[
+        list[Stream], Field(description="outputs that are for people and recordings: no node has to read them")
+    ] = []
+
+
+_checked_flow: Checked[FlowShape] = Checked(FlowShape)
+
+
+def read_shape(values: dict[str, Any]) -> tuple[FlowShape, list[Mistake]]:
+    """`values` as far as their form is right, and every mistake of form."""
+    flow, mistakes = _checked_flow(values)
+    left, wrong = copy.deepcopy(values), mistakes
+    while flow is None:
+        # What hangs on something wrong may be wrong only for that: so only the first round is reported.
+        for path in {_nearest(left, mistake.path) for mistake in wrong}:
+            _take_out(left, path)
+        flow, wrong = _checked_flow(left)
+    return flow, mistakes
+
+
+def yaml_schema() -> dict[str, Any]:
+    """The JSON Schema of a dataflow.yaml, for editors: docs/dataflow.schema.json."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **FlowShape.model_json_schema()}
+
+
+def is_written(values: Any, path: KeyPath) -> bool:
+    """Whether anything stands at `path`, right or wrong."""
+    return _nearest(values, path) == path
+
+
+def _nearest(values: Any, path: KeyPath) -> KeyPath:
+    """`path`, as far as it leads through `values`."""
+    for i, key in enumerate(path):
+        if (isinstance(values, dict) and key in values) or (
+            isinstance(values, list) and isinstance(key, int) and key < len(values)
+        ):
+            values = values[key]
+        else:
+            return path[:i]
+    return path
+
+
+def _take_out(values: Any, path: KeyPath) -> None:
+    """Delete what stands at `path`, unless it went with something else."""
+    if path and _nearest(values, path) == path:
+        for key in path[:-1]:
+            values = values[key]
+        del values[path[-1]]

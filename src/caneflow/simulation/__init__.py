@@ -1,0 +1,1 @@
+"""Worlds, walks and sensor models: numbers out of a seeded numpy Generator."""

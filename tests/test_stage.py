@@ -1,0 +1,190 @@
+"""A stage between its streams: checked arrivals, event time, numbered departures, each fault in its counter."""
+
+import logging
+from collections.abc import Mapping
+
+import pytest
+
+from caneflow.messages import GroundSpeed, Imu, MessageError, Sample
+from caneflow.messages.control import PortMark
+from caneflow.runtime import Context, Emitted, Operator, Refused
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.merge import END
+from caneflow.runtime.plan import InputPlan, OutputPlan
+from caneflow.runtime.stage import Stage
+
+
+class Echo(Operator):
+    """Says each IMU sample's gyro x as a speed; refuses negative ones; one last word at the end."""
+
+    inputs = {"a": Imu, "b": Imu}
+    outputs = {"speed": GroundSpeed}
+
+    def __init__(self, settings: object = None, context: Context | None = None) -> None:
+        self.seen: list[tuple[str, int]] = []
+
+    def handle(self, port: str, message: Sample) -> Emitted:
+        assert isinstance(message, Imu)
+        if message.gyro[0] < 0:
+            raise Refused(f"gyro x is {message.gyro[0]}; this operator wants it positive")
+        self.seen.append((port, message.stamp))
+        if port == "a":
+            yield "speed", speed(message.stamp, message.gyro[0])
+
+    def finish(self) -> Emitted:
+        yield "speed", speed(END - 1, 0.0)
+
+
+def speed(stamp: int, value: float) -> GroundSpeed:
+    return GroundSpeed(stamp=stamp, speed=value, quality=0.0, rays=1, valid=True)
+
+
+def imu(stamp: int, seq: int, x: float = 1.0) -> Imu:
+    return Imu(stamp=stamp, seq=seq, gyro=(x, 0.0, 0.0))
+
+
+def stage(operator: Operator | None = None, **overrides: object) -> Stage:
+    inputs: Mapping[str, InputPlan] = {
+        port: InputPlan(key=f"f/{port}/imu", schema="caneflow.Imu/1", writer=port, **overrides)  # type: ignore[arg-type]  # one override of a known field
+        for port in ("a", "b")
+    }
+    outputs = {"speed": OutputPlan(key="f/echo/speed", schema="caneflow.GroundSpeed/1")}
+    return Stage("echo", operator or Echo(), inputs, outputs)
+
+
+def emitted(host: Stage, now: int | None = None) -> list[tuple[int, int]]:
+    out = []
+    while (step := host.step(now)) is not None:
+        out += [(message.stamp, seq) for _, message, seq in step]
+    return out
+
+
+def test_outputs_are_numbered_and_the_end_is_passed_on() -> None:
+    host = stage()
+    for seq, stamp in enumerate((10, 20, 30)):
+        host.offer("a", imu(stamp, seq))
+    host.mark("b", PortMark(-1, END))
+    assert emitted(host) == [(10, 0), (20, 1), (30, 2)]
+    assert host.progress().handled == 30
+    host.mark("a", PortMark(2, END))
+    assert emitted(host) == [(END - 1, 3)]
+    assert host.finished
+    assert host.progress().ports["speed"] == PortMark(3, END)
+
+
+def test_a_mark_counts_only_when_what_was_sent_before_it_has_come() -> None:
+    host = stage()
+    host.offer("a", imu(10, 0))
+    host.mark("b", PortMark(0, 50))  # b sent its sample 0 before it said 50
+    assert emitted(host) == []
+    host.offer("b", imu(5, 0))
+    assert emitted(host) == [(10, 0)]
+    assert host.progress().handled == 10
+
+
+def test_repeated_backwards_and_lost_samples_are_told_apart(caplog: pytest.LogCaptureFixture) -> None:
+    host = stage()
+    host.offer("a", imu(10, 0))
+    host.offer("a", imu(10, 0))  # came again
+    host.offer("a", imu(9, 1))  # time went back
+    host.offer("a", imu(20, 5))  # 2, 3, 4 never came
+    counts = host.input_counts()["a"]
+    assert (counts.received, counts.repeated, counts.refused, counts.lost, counts.waiting) == (4, 1, 1, 3, 2)
+    assert "time goes backwards" in caplog.text
+    assert "3 samples lost before seq 5" in caplog.text
+
+
+def test_a_writer_that_was_restarted_and_counts_anew_is_followed() -> None:
+    host = stage()
+    host.offer("a", imu(10, 7))
+    host.offer("a", imu(20, 0))
+    host.offer("a", imu(30, 1))
+    counts = host.input_counts()["a"]
+    assert (counts.lost, counts.repeated, counts.waiting) == (7, 0, 3)
+
+
+def test_a_sample_that_cannot_be_decoded_is_refused_once_not_lost_as_well() -> None:
+    host = stage()
+    host.mark("b", PortMark(-1, END))
+    host.offer("a", imu(10, 0))
+    host.refuse("a", MessageError("truncated"))
+    host.mark("a", PortMark(1, END))  # the refused one was the last
+    assert emitted(host) == [(10, 0), (END - 1, 1)]
+    counts = host.input_counts()["a"]
+    assert (counts.received, counts.handled, counts.refused, counts.lost) == (2, 1, 1, 0)
+
+
+def test_each_cause_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    host = stage()
+    for _ in range(5):
+        host.refuse("a", MessageError("truncated"))
+    host.refuse("a", MessageError("too large"))
+    assert [r.levelno for r in caplog.records] == [logging.WARNING] * 2
+    assert host.input_counts()["a"].refused == 6
+
+
+def test_what_an_operator_refuses_is_counted_and_life_goes_on() -> None:
+    host = stage()
+    host.mark("b", PortMark(-1, END))
+    host.offer("a", imu(10, 0, x=-1.0))
+    host.offer("a", imu(20, 1))
+    assert emitted(host) == [(20, 0)]
+    counts = host.input_counts()["a"]
+    assert (counts.handled, counts.refused) == (1, 1)
+
+
+def test_what_comes_after_the_graph_went_on_is_late() -> None:
+    host = stage()
+    host.offer("a", imu(10, 0))
+    assert emitted(host) == []
+    assert host.held_by() == "b"
+    host.go_on_without("b")
+    assert emitted(host) == [(10, 0)]
+    host.offer("b", imu(4, 0))
+    host.offer("b", imu(12, 1))
+    counts = host.input_counts()["b"]
+    assert (counts.late, counts.waiting) == (1, 1)
+
+
+def test_a_full_queue_drops_its_oldest_and_counts() -> None:
+    host = stage(length=2)
+    for seq in range(5):
+        host.offer("a", imu(10 + seq, seq))
+    host.mark("b", PortMark(-1, END))
+    assert emitted(host) == [(13, 0), (14, 1)]
+    assert host.input_counts()["a"].dropped == 3
+
+
+def test_what_is_too_old_for_a_live_graph_is_dropped() -> None:
+    host = stage(max_age_ms=1.0)
+    host.mark("b", PortMark(-1, END))
+    host.offer("a", imu(1_000_000, 0))
+    host.offer("a", imu(2_500_000, 1))
+    assert emitted(host, now=3_000_000) == [(2_500_000, 0)]
+    assert host.input_counts()["a"].dropped == 1
+
+
+def test_missing_samples_do_not_hold_a_mark_for_ever() -> None:
+    host = stage()
+    host.mark("b", PortMark(-1, END))
+    host.mark("a", PortMark(2, END))  # three samples were sent, none came
+    assert emitted(host) == []
+    host.give_up("a")
+    assert emitted(host) == [(END - 1, 0)]
+    assert host.input_counts()["a"].lost == 3
+
+
+class Backwards(Echo):
+    """Emits the same stamp twice: a bug in an operator."""
+
+    def handle(self, port: str, message: Sample) -> Emitted:
+        yield "speed", speed(message.stamp, 0.0)
+        yield "speed", speed(message.stamp, 0.0)
+
+
+def test_an_operator_whose_stamps_do_not_increase_is_a_bug_that_shows() -> None:
+    host = stage(Backwards())
+    host.mark("b", PortMark(-1, END))
+    host.offer("a", imu(10, 0))
+    with pytest.raises(DataflowError, match="stamp 10 after 10; stamps of one stream strictly increase"):
+        emitted(host)

@@ -1,0 +1,127 @@
+"""`caneflow run`: a dataflow as processes, live or on a recording."""
+
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from caneflow.runtime.load import load
+
+from caneflow.messages.control import Counters
+from caneflow.runtime.deployment import Deployment, Replay, deploy
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.graph import Graph
+from caneflow.runtime.launch import Launcher, Outcome
+from caneflow.runtime.yaml_file import read_map
+
+
+def command(
+    file: Annotated[Path, typer.Argument(help="the dataflow, e.g. dataflow.yaml")],
+    replay: Annotated[
+        Path | None, typer.Option(metavar="REC", help="play this recording in the place of every driver")
+    ] = None,
+    speed: Annotated[
+        str,
+        typer.Option(metavar="X|max", help="of the replay, in times real time; max: as fast as the readers can"),
+    ] = "1",
+    start: Annotated[
+        float, typer.Option(metavar="S", min=0, help="s into the recording at which the replay begins")
+    ] = 0.0,
+    duration: Annotated[float | None, typer.Option(metavar="S", min=0, help="s of the recording to play")] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="begin again at the end, with stamps that go on")] = False,
+    without: Annotated[
+        list[str] | None, typer.Option(metavar="NODE", help="leave this node out (may be given again)")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="OUT", help="write every stream to this recording")
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(metavar="YAML", help="a rig to lay over the recording's and the file's")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NODE.KEY=VALUE", help="override a setting (may be given again)"),
+    ] = None,
+) -> None:
+    """Start every node of a dataflow as a process and follow it to its end; Ctrl-C ends everything.
+
+    Exit status 0: a replay ran to its end and lost nothing. 1: a node failed for good, or samples were lost.
+    2: the file, the recording or an option cannot be used. 130: Ctrl-C.
+
+    Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record track.mcap --set fusion.method=kalman
+    """
+    graph = load(file, settings or ())
+    for warning in graph.warnings:
+        print(warning, file=sys.stderr)
+    played = _replay(replay, speed, start, duration, loop=loop, without=without or [])
+    deployment = deploy(graph, replay=played, record=record, rig=_rig(rig))
+    started = time.monotonic()
+    outcome = Launcher(deployment, _restarts(graph), report).run()
+    summary(deployment, outcome, time.monotonic() - started)
+    raise typer.Exit(outcome.status)
+
+
+def report(node: str, line: str) -> None:
+    """Print a node's line under its name."""
+    print(f"{node} | {line}", file=sys.stderr, flush=True)
+
+
+def summary(deployment: Deployment, outcome: Outcome, took_s: float) -> None:
+    """Print how the run ended: what each node gave, what was refused or lost, what failed."""
+    for node, counters in outcome.counters.items():
+        if text := _counted(counters):
+            print(f"{node}: {text}")
+    for failure in outcome.failures:
+        print(f"caneflow run: {failure}", file=sys.stderr)
+    if not outcome.failures and not outcome.interrupted:
+        print(f"{deployment.flow}: ran to its end in {took_s:.1f} s")
+
+
+def _counted(counters: Counters) -> str:
+    given = [f"{sent} x {port}" for port, sent in counters.outputs.items()]
+    troubles = [
+        f"{port}: {number} {what}"
+        for port, counts in counters.inputs.items()
+        for what in ("refused", "repeated", "lost", "dropped", "late")
+        if (number := getattr(counts, what))
+    ]
+    if counters.refused:
+        troubles.append(f"{counters.refused} refused")
+    return "; ".join(filter(None, [", ".join(given), *troubles]))
+
+
+def _replay(
+    recording: Path | None, speed: str, start: float, duration: float | None, *, loop: bool, without: list[str]
+) -> Replay | None:
+    if recording is None:
+        return None
+    return Replay(
+        recording=recording,
+        speed=_speed(speed),
+        start_s=start,
+        duration_s=duration,
+        loop=loop,
+        without=frozenset(without),
+    )
+
+
+def _speed(text: str) -> float:
+    if text == "max":
+        return math.inf
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (0 < value < math.inf):
+        raise DataflowError(f"--speed {text}: is no speed; give times real time, e.g. 1 or 2.5, or max")
+    return value
+
+
+def _rig(path: Path | None) -> dict[str, Any] | None:
+    return None if path is None else read_map(path)
+
+
+def _restarts(graph: Graph) -> dict[str, Any]:
+    return {name: node.restart for name, node in graph.nodes.items()}
