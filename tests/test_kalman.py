@@ -40,7 +40,7 @@ def textbook(
     """
     eye, zero = np.eye(3), np.zeros((3, 3))
     x: Floats = np.zeros(9)
-    p: Floats = np.kron(np.diag([INITIAL_ACCELERATION**2, INITIAL_VELOCITY**2, 0.0]), eye)
+    p: Floats = np.diag(np.repeat([INITIAL_ACCELERATION**2, INITIAL_VELOCITY**2, 0.0], 3))
     states: list[Floats] = [x]
     covariances: list[Floats] = [p]
     for k in range(1, len(stamps)):

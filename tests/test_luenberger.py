@@ -221,17 +221,21 @@ def test_the_order_of_two_samples_with_one_stamp_does_not_matter() -> None:
 
 
 def test_a_gap_is_counted_and_crossed_with_the_last_velocity() -> None:
+    """A jerk of 5 m/s^2 just before the gap must not be held for two seconds."""
     observer = LuenbergerObserver(LuenbergerSettings(), boresight=BORESIGHT)
     orientation = held(0.0)
-    before = walk(observer, 500, 0.6, orientation)
-    # a jerk of 5 m/s^2 just before the gap must not be held for two seconds
-    last = START_NS + 500 * PERIOD_NS
-    jerked = observer.imu(last, STILL, None, orientation, body(orientation, (5.0, 0.0, 0.0)))
+    for k in range(500):
+        stamp = START_NS + k * PERIOD_NS
+        observer.speed(stamp, 0.6, 0.05, True, None)
+        jerk = body(orientation, (5.0, 0.0, 0.0)) if k >= 490 else STILL
+        before = observer.imu(stamp, STILL, None, orientation, jerk)
     assert observer.gaps == 0
-    after = observer.imu(last + 2_000_000_000, STILL, None, orientation, STILL)
+    assert observer.acceleration[0] == pytest.approx(5.0, abs=0.02)
+    after = observer.imu(stamp + 2_000_000_000, STILL, None, orientation, STILL)
     assert observer.gaps == 1
-    assert after.position[0] - jerked.position[0] == pytest.approx(1.2, abs=1e-9)
-    assert before.velocity[0] == pytest.approx(0.6)
+    corrected = 0.95 * before.velocity[0] + 0.05 * 0.6  # by the last speed, as ever
+    assert after.velocity[0] == pytest.approx(corrected)
+    assert after.position[0] - before.position[0] == pytest.approx(2.0 * corrected)
 
 
 def test_half_a_second_is_not_a_gap_yet() -> None:

@@ -114,8 +114,9 @@ def test_a_swing_whose_peak_is_too_slow_is_none() -> None:
     assert follow(Swinging(swings=10), settings)[0].steps == 10
 
 
-def test_swings_that_follow_too_fast_are_taken_together() -> None:
-    shs, _ = follow(Swinging(swings=20, duration=0.3))
+@pytest.mark.parametrize("duration", [0.3, 0.43])
+def test_swings_that_follow_too_fast_are_taken_together(duration: float) -> None:
+    shs, _ = follow(Swinging(swings=20, duration=duration))
     # 10 pairs, or 9 between two single ones, by where the rest's own last stationary point lies
     assert shs.steps in (10, 11)
 

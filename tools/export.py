@@ -2,20 +2,18 @@
 
 import csv
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import msgspec
-import numpy as np
 import typer
+from msgspec import inspect
 
-from caneflow.messages import MessageError, Pose, Sample, decode
-from caneflow.recording import Recorded, Recording, RecordingError, Stream
-
-TRUTH = ("truth", "pose")
+from caneflow.messages import Pose, Sample
+from caneflow.recording import TRUTH, Recorded, Recording, RecordingError, Stream
 
 
 class Format(StrEnum):
@@ -32,17 +30,16 @@ def command(
         typer.Option(
             "--format",
             help="tum: a line per pose, `t x y z qx qy qz qw` in s and m, as evo reads it. "
-            "csv: a row per sample, stamp in ns, the rest in the units of docs/messages.md.",
+            "csv: a row per sample; stamp in ns, the rest in SI units and rad.",
         ),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; by default the terminal.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="File to write; by default standard output."),
     ] = None,
     stream: Annotated[
         str | None,
-        typer.Option(
-            metavar="NODE/PORT", help="Stream to write; by default the only one that fits, ground truth aside."
-        ),
+        typer.Option(metavar="NODE/PORT", help="Stream to write; by default the only one that fits, truth aside."),
     ] = None,
 ) -> None:
     """Write one stream of a recording as text.
@@ -60,47 +57,94 @@ def command(
 
 
 def write_tum(samples: Iterable[Recorded], text: TextIO) -> None:
-    """Write poses as lines of `t x y z qx qy qz qw`: stamp in s to the ns, m, quaternion with w last."""
+    """Write poses as lines of `t x y z qx qy qz qw`: s to the ns, m, quaternion with w last."""
     for sample in samples:
-        pose = _decoded(sample)
+        pose = sample.decoded()
         assert isinstance(pose, Pose)
         w, x, y, z = pose.orientation
-        seconds = f"{pose.stamp // 10**9}.{pose.stamp % 10**9:09d}"
-        print(seconds, *pose.position, x, y, z, w, file=text)
+        print(f"{pose.stamp // 10**9}.{pose.stamp % 10**9:09d}", *pose.position, x, y, z, w, file=text)
 
 
 def write_csv(samples: Iterable[Recorded], text: TextIO) -> None:
-    """Write a row per sample: vectors as one column per element, arrays left out, absent values empty."""
+    """Write a row per sample: vectors as a column per element, absent values empty, arrays left out."""
     rows = csv.writer(text, lineterminator="\n")
-    columns: dict[str, int | None] | None = None
+    columns: dict[str, int] | None = None
     for sample in samples:
-        message = _decoded(sample)
+        message = sample.decoded()
         if columns is None:
             columns, arrays = _columns(type(message))
             if arrays:
-                print(f"{sample.key}: left out {', '.join(arrays)}: arrays do not fit into a row", file=sys.stderr)
+                print(
+                    f"{sample.key}: left out {', '.join(arrays)}: an array does not fit into a row",
+                    file=sys.stderr,
+                )
             rows.writerow(name for field, n in columns.items() for name in _names(field, n))
         rows.writerow(value for field, n in columns.items() for value in _values(getattr(message, field), n))
 
 
-def _columns(kind: type[Sample]) -> tuple[dict[str, int | None], list[str]]:
-    """Number of elements (None: a plain value) by field, and the fields that are arrays; from the type alone."""
-    columns: dict[str, int | None] = {}
+def _chosen(source: Recording, form: Format, stream: str | None) -> Stream:
+    if stream is not None:
+        node, _, port = stream.partition("/")
+        chosen = source.stream(node, port)
+        if form is Format.TUM and chosen.schema != Pose.schema:
+            raise RecordingError(f"{source.path}: {stream} holds {chosen.schema}; tum takes {Pose.schema}")
+        return chosen
+    there = [
+        each
+        for each in source.streams.values()
+        if each.count and (form is Format.CSV or each.schema == Pose.schema)
+    ]
+    fitting = [each for each in there if (each.node, each.port) != TRUTH]
+    if len(fitting) != 1:
+        kind = "stream of poses" if form is Format.TUM else "stream with samples"
+        names = ", ".join(f"{each.node}/{each.port}" for each in there)
+        raise RecordingError(
+            f"{source.path}: choose what to write with --stream: {names}"
+            if there
+            else f"{source.path}: has no {kind}"
+        )
+    return fitting[0]
+
+
+def _columns(kind: type[Sample]) -> tuple[dict[str, int], list[str]]:
+    """By field how many elements its vector has (0: it is a plain value), and the fields that are arrays."""
+    columns: dict[str, int] = {}
     arrays: list[str] = []
     for field in msgspec.structs.fields(kind):
-        if _in_type(field.type, np.ndarray):
-            arrays.append(field.name)
-        else:
-            columns[field.name] = _tuple_length(msgspec.inspect.type_info(field.type))
+        match _inner(inspect.type_info(field.type)):
+            case inspect.CustomType():
+                arrays.append(field.name)
+            case inspect.TupleType(item_types=items):
+                columns[field.name] = len(items)
+            case _:
+                columns[field.name] = 0
     return columns, arrays
 
 
-def _tuple_length(described: msgspec.inspect.Type) -> int | None:
+def _inner(described: inspect.Type) -> inspect.Type:
+    """The type without its description, and without `| None`."""
     match described:
-        case msgspec.inspect.TupleType(item_types=items):
-            return len(items)
-        case msgspec.inspect.UnionType(types=options):
-            return next((n for option in options if (n := _tuple_length(option)) is not None), None)
-        case msgspec.inspect.Metadata(type=inner):
-            return _tuple_length(inner)
-    return None
+        case inspect.Metadata(type=inner):
+            return _inner(inner)
+        case inspect.UnionType(types=options):
+            return next(_inner(option) for option in options if not isinstance(option, inspect.NoneType))
+    return described
+
+
+def _names(field: str, length: int) -> list[str]:
+    return [f"{field}_{index}" for index in range(length)] or [field]
+
+
+def _values(value: Any, length: int) -> Sequence[Any]:
+    if length == 0:
+        return [value]
+    return [None] * length if value is None else value
+
+
+@contextmanager
+def _writing_to(path: Path | None) -> Iterator[TextIO]:
+    if path is None:
+        yield sys.stdout
+    else:
+        with path.open("w", encoding="utf-8", newline="") as text:
+            yield text

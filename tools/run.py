@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from caneflow.runtime.load import load
 
 from caneflow.messages.control import Counters
+from caneflow.runtime.dataflow import load, read_rig
 from caneflow.runtime.deployment import Deployment, Replay, deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph import Graph
+from caneflow.runtime.in_process import InProcess
 from caneflow.runtime.launch import Launcher, Outcome
-from caneflow.runtime.yaml_file import read_map
 
 
 def command(
@@ -23,9 +22,9 @@ def command(
         Path | None, typer.Option(metavar="REC", help="play this recording in the place of every driver")
     ] = None,
     speed: Annotated[
-        str,
-        typer.Option(metavar="X|max", help="of the replay, in times real time; max: as fast as the readers can"),
-    ] = "1",
+        str | None,
+        typer.Option(metavar="X|max", help="of the replay, in times real time [default: 1; in-process: max]"),
+    ] = None,
     start: Annotated[
         float, typer.Option(metavar="S", min=0, help="s into the recording at which the replay begins")
     ] = 0.0,
@@ -34,6 +33,9 @@ def command(
     without: Annotated[
         list[str] | None, typer.Option(metavar="NODE", help="leave this node out (may be given again)")
     ] = None,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="all nodes in this process, as fast as the processor allows")
+    ] = False,
     record: Annotated[
         Path | None, typer.Option(metavar="OUT", help="write every stream to this recording")
     ] = None,
@@ -50,15 +52,20 @@ def command(
     Exit status 0: a replay ran to its end and lost nothing. 1: a node failed for good, or samples were lost.
     2: the file, the recording or an option cannot be used. 130: Ctrl-C.
 
-    Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record track.mcap --set fusion.method=kalman
+    Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record out.mcap --set fusion.method=kalman
     """
     graph = load(file, settings or ())
     for warning in graph.warnings:
         print(warning, file=sys.stderr)
+    speed = speed or ("max" if in_process else "1")
     played = _replay(replay, speed, start, duration, loop=loop, without=without or [])
     deployment = deploy(graph, replay=played, record=record, rig=_rig(rig))
     started = time.monotonic()
-    outcome = Launcher(deployment, _restarts(graph), report).run()
+    if in_process:
+        programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
+        outcome = InProcess(deployment, programs).run()
+    else:
+        outcome = Launcher(deployment, {name: node.restart for name, node in graph.nodes.items()}, report).run()
     summary(deployment, outcome, time.monotonic() - started)
     raise typer.Exit(outcome.status)
 
@@ -120,8 +127,4 @@ def _speed(text: str) -> float:
 
 
 def _rig(path: Path | None) -> dict[str, Any] | None:
-    return None if path is None else read_map(path)
-
-
-def _restarts(graph: Graph) -> dict[str, Any]:
-    return {name: node.restart for name, node in graph.nodes.items()}
+    return None if path is None else read_rig(path)

@@ -37,7 +37,7 @@ class AnalyticSignal:
                 f"a pulse at {carrier:.4g} Hz, {bandwidth:.3g} Hz wide, does not show in {bins} samples "
                 f"every {range_step:.4g} m: they hold 0..{frequencies[-1]:.4g} Hz"
             )
-        self._gain = np.where(inside, np.float32(2), np.float32(0))
+        self._gain = np.where(inside, 2, 0).astype(np.complex64)  # of the type it scales: no casts
         self._bins = bins
 
     def __call__(self, scans: NDArray[np.number]) -> NDArray[np.complex64]:

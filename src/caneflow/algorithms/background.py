@@ -19,8 +19,8 @@ class Background:
         self._mean: NDArray[np.complex64] | None = None
         self._weight = 0.0  # sum of exp(-age / time constant) over the scans seen
 
-    def remove(self, scan: NDArray[np.complex64], elapsed: float) -> NDArray[np.complex64]:
-        """`scan`, shape (M,), less the mean of the past and itself; the first one gives zeros.
+    def remove(self, scan: NDArray[np.complex64], elapsed: float) -> None:
+        """Take the mean of the past and itself off `scan`, shape (M,), in place; nothing is left of the first one.
 
         `elapsed` is the time (s) since the scan before. Counting every scan with weight 1 when it arrives makes the
         mean right from the first scan on: no start value has to fade out.
@@ -28,5 +28,7 @@ class Background:
         if self._mean is None:
             self._mean = np.zeros_like(scan)
         self._weight = self._weight * math.exp(-elapsed / self._time_constant) + 1.0
-        self._mean += (scan - self._mean) * np.float32(1.0 / self._weight)
-        return scan - self._mean
+        share = 1.0 / self._weight
+        scan -= self._mean
+        self._mean += scan * np.float32(share)
+        scan *= np.float32(1.0 - share)

@@ -5,7 +5,9 @@ Per axis of R0: state x = (a, v), m/s^2 and m/s; A = [[1, 0], [T, 1]]; C = I; L 
 
 import cmath
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
+
+from annotated_types import Gt, Lt
 
 from caneflow.algorithms.dead_reckoning import (
     LONGEST_INTERVAL,
@@ -18,6 +20,7 @@ from caneflow.algorithms.dead_reckoning import (
 )
 from caneflow.algorithms.rotations import Quaternion, Vector
 
+Pole: TypeAlias = Annotated[float, Gt(-1), Lt(1)]
 Gain: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
 
@@ -25,10 +28,10 @@ Gain: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 class LuenbergerSettings:
     """What may be set; raises ValueError for an observer that does not converge."""
 
-    pole_acceleration: float = 0.5  # per sample, magnitude below 1
-    pole_velocity: float = 0.95  # per sample, magnitude below 1; 0.98 and above lags visibly
+    pole_acceleration: Pole = 0.5  # per sample, magnitude below 1
+    pole_velocity: Pole = 0.95  # per sample, magnitude below 1; 0.98 and above lags visibly
     gain: Gain | None = None  # L itself instead of poles; rows a, v; columns innovation of a, of v
-    interval: float = 0.01  # s, nominal; only for checking `gain`
+    interval: Annotated[float, Gt(0)] = 0.01  # s, nominal; only for checking `gain`
     compensate_delay: DelayCompensation = "none"
 
     def __post_init__(self) -> None:

@@ -112,7 +112,9 @@ class MovingReturnsFilter:
         self, scans: NDArray[np.number], lost: int, elapsed: float, scan_period: float
     ) -> NDArray[np.complex64]:
         analytic = self._to_analytic(scans) if self._to_analytic else scans.astype(np.complex64)
-        moving = np.zeros((lost + len(analytic), analytic.shape[1]), dtype=np.complex64)
-        for row, scan in enumerate(analytic):
-            moving[lost + row] = self._background.remove(scan, elapsed if row == 0 else scan_period)
-        return moving
+        for scan in analytic:
+            self._background.remove(scan, elapsed)
+            elapsed = scan_period
+        if not lost:
+            return analytic
+        return np.concatenate([np.zeros((lost, analytic.shape[1]), dtype=np.complex64), analytic])

@@ -6,6 +6,8 @@ One estimate per frame, over the newest `window` scans; it belongs to the window
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from operator import mul
+from statistics import median
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,10 +17,10 @@ from scipy.fft import fft
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
 from caneflow.algorithms.edges import EDGE_BEYOND_SPEED, superior_edges
-from caneflow.algorithms.footprint import CaneGeometry, Rays, antenna_height, pitch, rays_on_ground
+from caneflow.algorithms.footprint import NO_RAYS, CaneGeometry, Fan, RayCaster, Rays, antenna_height, pitch
 from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT, SlowTimeWindow, hann, speed_per_bin
-from caneflow.algorithms.rest import RestSettings, difference_and_floor, difference_weights, is_at_rest
+from caneflow.algorithms.range_doppler import SlowTimeWindow, hann, speed_per_bin
+from caneflow.algorithms.rest import RestSettings, is_at_rest, peak_and_floor
 from caneflow.algorithms.rotations import Quaternion
 
 
@@ -72,16 +74,19 @@ class PaperSpeed:
             )
         self._settings = settings
         self._geometry = geometry
+        self._fan = Fan(
+            rays=settings.rays,
+            half_width=0.5 * settings.aperture_share * geometry.aperture,
+            shallowest=settings.shallowest,
+            steepest=settings.steepest,
+        )
         self._weights = hann(settings.window)
-        self._difference_weights = difference_weights(settings.transform)
-        self._offsets = np.linspace(-1.0, 1.0, settings.rays)
         # Slow-time rows to transform; what lies behind the window stays 0.
-        self._padded = np.zeros((settings.rays * settings.rows_per_ray, settings.transform), np.complex64)
+        self._padded = np.zeros((settings.rays + 2, settings.transform), np.complex64)
         self._window = SlowTimeWindow(length=settings.window, bins=0)
+        self._caster: RayCaster | None = None
         self._stamps_ns: deque[int] = deque(maxlen=settings.window)
         self._stand_ins: deque[bool] = deque(maxlen=settings.window)  # which scans of the window were lost
-        self._cell = np.zeros(1, dtype=np.intp)  # bins from a ray's row to the rows averaged with it
-        self._bins = 0
 
     def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> SpeedEstimate:
         """The estimate after one more frame.
@@ -99,20 +104,24 @@ class PaperSpeed:
         orientation = attitudes.at((oldest_ns + newest_ns) // 2)
         if orientation is None or sum(self._stand_ins) > settings.most_lost * settings.window:
             return _nothing(delay)
-        rays = self._rays(orientation, returns.parameters)
-        if len(rays.rows) < settings.fewest_rays:
+        rays = self._rays(orientation)
+        if rays is NO_RAYS:
             return _nothing(delay)
         power = self._power(rays)
+        spectrum = power.sum(axis=0)
+        peak, floor = peak_and_floor(spectrum, settings.transform / settings.window)
         turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
-        total, floor = difference_and_floor(power.sum(axis=0), self._difference_weights)
-        if turn_rate is not None and is_at_rest(total, floor, turn_rate, settings.rest):
-            return SpeedEstimate(speed=0.0, quality=0.0, rays=len(rays.rows), valid=True, delay=delay)
+        if turn_rate is not None and is_at_rest(peak, floor, turn_rate, settings.rest):
+            return SpeedEstimate(speed=0.0, quality=0.0, rays=settings.rays, valid=True, delay=delay)
+        half = settings.transform // 2
+        if spectrum[half:].sum() > spectrum[:half].sum():
+            return _nothing(delay)  # the ground recedes, or approaches so fast that its Doppler has come round
         per_bin = speed_per_bin(
-            scan_period=(newest_ns - oldest_ns) * 1e-9 / (settings.window - 1),  # measured, not nominal
+            scan_period=delay * 2 / (settings.window - 1),  # measured, not nominal
             carrier=returns.parameters.carrier,
             transform=settings.transform,
         )
-        speeds, weights = self._ray_speeds(power, floor / len(power), per_bin / rays.cosines)
+        speeds, weights = self._ray_speeds(power, floor / settings.rays, per_bin / rays.cosines)
         return self._average(speeds, weights, delay)
 
     def _push(self, returns: MovingReturns) -> None:
@@ -124,80 +133,72 @@ class PaperSpeed:
             self._stand_ins.append(row < returns.lost)
 
     def _start_anew(self, bins: int, parameters: RadarParameters) -> None:
-        settings = self._settings
-        self._window = SlowTimeWindow(length=settings.window, bins=bins)
+        self._window = SlowTimeWindow(length=self._settings.window, bins=bins)
+        self._caster = RayCaster(
+            self._fan, bins=bins, range_start=parameters.range_start, range_step=parameters.range_step
+        )
         self._stamps_ns.clear()
         self._stand_ins.clear()
-        self._bins = bins
-        half_resolution = SPEED_OF_LIGHT / (4 * parameters.bandwidth) / parameters.range_step  # bins
-        spread = np.linspace(-1.0, 1.0, settings.rows_per_ray) if settings.rows_per_ray > 1 else np.zeros(1)
-        self._cell = np.rint(spread * half_resolution).astype(np.intp)
 
-    def _rays(self, orientation: Quaternion, parameters: RadarParameters) -> Rays:
-        settings, geometry = self._settings, self._geometry
-        return rays_on_ground(
-            self._offsets,
-            height=antenna_height(geometry, orientation),
-            axis=pitch(geometry, orientation),
-            half_width=0.5 * settings.aperture_share * geometry.aperture,
-            shallowest=settings.shallowest,
-            steepest=settings.steepest,
-            range_start=parameters.range_start,
-            range_step=parameters.range_step,
-            bins=self._bins,
-        )
+    def _rays(self, orientation: Quaternion) -> Rays:
+        assert self._caster is not None, "the first frame restarts"
+        height = antenna_height(self._geometry, orientation)
+        return self._caster.cast(height=height, axis=pitch(self._geometry, orientation))
 
     def _power(self, rays: Rays) -> NDArray[np.float32]:
-        """Doppler power along each ray, in sum over its rows; shape (K, transform), FFT order."""
-        settings = self._settings
-        rows = np.clip(rays.rows[:, None] + self._cell, 0, self._bins - 1).ravel()
-        padded = self._padded[: len(rows)]
-        np.multiply(self._window.view()[rows], self._weights, out=padded[:, : settings.window])
-        spectra = fft(padded, axis=-1)
-        power = spectra.real**2 + spectra.imag**2
-        return power.reshape(len(rays.rows), settings.rows_per_ray, -1).sum(axis=1)
+        """Doppler power along each ray, in sum with its neighbours'; shape (K, transform), FFT order.
+
+        One range bin's spectrum is speckle: its steepest fall is as often that of a chance gap in the ground as that
+        of the fastest piece of it. Three bins, a range cell apart, bring out the edge where theory has it.
+        """
+        np.multiply(
+            self._window.view()[rays.rows], self._weights, out=self._padded[:, : self._settings.window]
+        )
+        power = np.abs(fft(self._padded, axis=-1))
+        power *= power
+        summed = power[:-2] + power[1:-1]
+        summed += power[2:]
+        return summed
 
     def _ray_speeds(
         self, power: NDArray[np.float32], floor: float, per_bin: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Speed over ground (m/s, eq. 2) of the rays that show one, and their weights.
+    ) -> tuple[list[float], list[float]]:
+        """Speed over ground (m/s, eq. 2) of the rays that show one, and the heights of their edges.
 
-        A ray shows one if its Doppler stands out of the noise `floor`, is mostly that of approaching ground (a speed
-        above the limit would come round on the other side), and its edge lies well below the limit.
+        A ray shows one if its Doppler stands out of the noise `floor`, and if its edge lies well below the limit of
+        unambiguous Doppler.
         """
         settings = self._settings
         half = settings.transform // 2
         approaching = power[:, : half + 1]
         edges, falls = superior_edges(np.sqrt(approaching))
-        cell = settings.transform / settings.window  # Doppler bins
-        clear = (approaching.max(axis=1) > settings.least_peak * floor) & (edges < settings.alias_share * half)
-        clear &= approaching.sum(axis=1) > power[:, half + 1 :].sum(axis=1)
+        shows = approaching.max(axis=1) > settings.least_peak * floor
+        shows &= edges < settings.alias_share * half
         if settings.compensate_edge:
+            cell = settings.transform / settings.window  # Doppler bins
             edges = np.maximum(edges - settings.edge_beyond_speed * cell, 0.0)
-        return (edges * per_bin)[clear], falls[clear].astype(np.float64)
+        return (edges * per_bin)[shows].tolist(), falls[shows].tolist()
 
-    def _average(self, speeds: NDArray[np.float64], weights: NDArray[np.float64], delay: float) -> SpeedEstimate:
+    def _average(self, speeds: list[float], weights: list[float], delay: float) -> SpeedEstimate:
+        """Eq. 3 and 4 over the rays that agree. Plain Python: for a handful of numbers numpy's calls cost more."""
         settings = self._settings
         if len(speeds) < settings.fewest_rays:
             return _nothing(delay)
-        agrees = np.abs(speeds - _median(speeds)) <= settings.agreement
-        speeds, weights = speeds[agrees], weights[agrees]
+        centre = median(speeds)
+        if settings.average == "weighted":
+            pairs = [(s, w) for s, w in zip(speeds, weights, strict=True) if abs(s - centre) <= settings.agreement]
+            speeds, weights = [s for s, _ in pairs], [w for _, w in pairs]
+        else:
+            speeds = [s for s in speeds if abs(s - centre) <= settings.agreement]
+            weights = [1.0] * len(speeds)
         if len(speeds) < settings.fewest_rays:
             return _nothing(delay)
-        if settings.average != "weighted":
-            weights = np.ones_like(speeds)
-        weights = weights / weights.sum()
-        mean = float((weights * speeds).sum())
-        centre = _median(speeds) if settings.average == "median" else mean
-        spread = math.sqrt(float((weights * (speeds - centre) ** 2).sum()))
+        total = sum(weights)
+        if settings.average != "median":
+            centre = sum(map(mul, speeds, weights)) / total
+        spread = math.sqrt(sum([w * (s - centre) ** 2 for s, w in zip(speeds, weights, strict=True)]) / total)
         return SpeedEstimate(speed=centre, quality=spread, rays=len(speeds), valid=True, delay=delay)
 
 
 def _nothing(delay: float) -> SpeedEstimate:
     return SpeedEstimate(speed=0.0, quality=math.inf, rays=0, valid=False, delay=delay)
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    ordered = np.sort(values)  # numpy's median costs ten times as much for a handful
-    middle = len(ordered) // 2
-    return float(ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)

@@ -1,6 +1,6 @@
 """Every message that crosses a process, and its encoding: the contract of docs/messages.md."""
 
-from caneflow.messages.codec import MAX_PAYLOAD, MEDIA_TYPE, decode, encode, json_schema, numbered
+from caneflow.messages.codec import MAX_PAYLOAD, MEDIA_TYPE, decode, encode, json_schema, numbered, with_number
 from caneflow.messages.errors import MessageError
 from caneflow.messages.keys import NAME, NAME_RULE, control_key, sample_key, stream_of
 from caneflow.messages.samples import (
@@ -35,4 +35,5 @@ __all__ = [
     "numbered",
     "sample_key",
     "stream_of",
+    "with_number",
 ]

@@ -38,10 +38,15 @@ def decode(payload: bytes, kind: type[S]) -> S:
     return message
 
 
-def numbered(message: Sample, seq: int) -> bytes:
-    """`message` encoded as number `seq` of its stream: only the host that publishes it knows its number."""
+def with_number(message: Sample, seq: int) -> Sample:
+    """`message` as number `seq` of its stream: a host's privilege, only who publishes it knows its number."""
     msgspec.structs.force_setattr(message, "seq", seq)
-    return _encoder.encode(message)
+    return message
+
+
+def numbered(message: Sample, seq: int) -> bytes:
+    """`message` encoded as number `seq` of its stream."""
+    return _encoder.encode(with_number(message, seq))
 
 
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:

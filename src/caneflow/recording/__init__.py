@@ -1,11 +1,12 @@
 """What a flow said, kept in a file: MCAP in and out, as docs/recordings.md lays it out."""
 
 from caneflow.recording.errors import RecordingError
-from caneflow.recording.reader import Recorded, Recording, Stream
+from caneflow.recording.reader import TRUTH, Recorded, Recording, Stream
 from caneflow.recording.recover import Recovered, recover
 from caneflow.recording.writer import Compression, Origin, RecordingWriter
 
 __all__ = [
+    "TRUTH",
     "Compression",
     "Origin",
     "Recorded",

@@ -24,7 +24,7 @@ CHECKED_FOOTER = RECORD.size + 16  # bytes of the footer that its check sum cove
 MESSAGE = int(Opcode.MESSAGE)  # comparing with the enum's member takes as long as unpacking a message
 MAX_BARE = 2**20  # bytes of messages outside any chunk that are taken as one block
 
-# Stamp, seq, log time; where in the block's data the payload starts and ends. Plain, as thousands are made at once.
+# Stamp, seq, log time; where in the block's data the payload starts and ends. Plain, as there are thousands.
 Entry: TypeAlias = tuple[int, int, int, int, int]
 
 # What mcap, its two decompressors and struct raise on bytes that are not what they should be.
@@ -117,33 +117,65 @@ def content_of(file: BinaryIO, block: Block, declared: Declarations) -> Content:
     raw = file.read(block.length)
     if len(raw) < block.length:
         raise ValueError(f"{len(raw)} of {block.length} bytes are there")
-    return Content(_unpacked(raw), declared)
+    content = Content(_unpacked(raw), declared)
+    if missing := block.topics - content.messages.keys():
+        raise ValueError(f"no message of {', '.join(missing)}")
+    return content
 
 
 def walked(file: BinaryIO) -> Layout:
     """Where things are in `file`, found record by record, up to its end or to where it was cut."""
-    layout = Layout(complete=False)
-    bare = bytearray()  # messages outside any chunk, as some writers leave them, gathered into blocks
-    end = len(MAGIC)
-    for opcode, offset, raw in _records(file):
-        if bare and (opcode != MESSAGE or len(bare) >= MAX_BARE):
-            _add_block(layout, offset - len(bare), bytes(bare))
-            bare.clear()
-        end = offset + len(raw)
-        if opcode == MESSAGE:
-            bare += raw
-        elif opcode == Opcode.CHUNK:
-            _add_block(layout, offset, raw)
-        elif opcode == Opcode.FOOTER:
+    layout = Layout(complete=False, declared=_summarised_declarations(file))
+    in_chunks = in_summary = False
+    for opcode, offset, raw in _stretches(file):
+        if opcode == Opcode.FOOTER:
             layout.complete = True
+        elif in_summary:
+            continue
+        elif opcode == Opcode.DATA_END:
+            in_summary = True
+        elif opcode == Opcode.CHUNK:
+            in_chunks = True
+            _add_block(layout, offset, raw)
+        elif opcode == MESSAGE and not in_chunks:
+            _add_block(layout, offset, raw)
         else:
-            try:
-                _note(layout, opcode, raw[RECORD.size :])
-            except DAMAGE:
-                layout.damaged.append(offset)
-    if bare:
-        _add_block(layout, end - len(bare), bytes(bare))
+            _add_other(layout, opcode, offset, raw)
     return layout
+
+
+def _summarised_declarations(file: BinaryIO) -> Declarations:
+    """What the summary declares, if there is one: the chunk that did so first may be damaged."""
+    try:
+        by_summary = _summarised(file)
+    except DAMAGE:
+        by_summary = None
+    return by_summary.declared if by_summary else Declarations()
+
+
+def _stretches(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
+    """Opcode, offset and bytes of every record; neighbouring messages outside any chunk are taken together."""
+    messages, start = bytearray(), 0
+    for opcode, offset, raw in _records(file):
+        if messages and (opcode != MESSAGE or len(messages) >= MAX_BARE):
+            yield MESSAGE, start, bytes(messages)
+            messages.clear()
+        if opcode == MESSAGE:
+            start = start if messages else offset
+            messages += raw
+        else:
+            yield opcode, offset, raw
+    if messages:
+        yield MESSAGE, start, bytes(messages)
+
+
+def _add_other(layout: Layout, opcode: int, offset: int, raw: bytes) -> None:
+    try:
+        if opcode == MESSAGE:
+            raise ValueError("a message outside the chunks of a file that has chunks: something else, damaged")
+        _note(layout, opcode, raw[RECORD.size :])
+    except DAMAGE:
+        layout.damaged.append(offset)
 
 
 def _add_block(layout: Layout, offset: int, raw: bytes) -> None:

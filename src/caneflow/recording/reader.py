@@ -14,10 +14,11 @@ from weakref import WeakValueDictionary
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
-from caneflow.messages import SAMPLES, Sample, stream_of
+from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.recording.errors import RecordingError
 from caneflow.recording.layout import DAMAGE, MAGIC, Block, Content, Layout, content_of, layout_of
 
+TRUTH = ("truth", "pose")  # node and port of the ground truth, where there is any
 EXPECTED = "a recording is an MCAP file as `caneflow run --record` writes it"
 
 
@@ -45,6 +46,15 @@ class Recorded(NamedTuple):
     seq: int
     log_time: int  # ns, when it was received
     payload: bytes
+
+    def decoded(self) -> Sample:
+        """The sample itself; raises RecordingError, naming stream and number, when it breaks the contract."""
+        if self.kind is None:
+            raise RecordingError(f"{self.key}: holds messages that this version of caneflow does not know")
+        try:
+            return decode(self.payload, self.kind)
+        except MessageError as error:
+            raise RecordingError(f"{self.key}: sample {self.seq}: {error}") from error
 
 
 class Recording:
@@ -111,6 +121,10 @@ class Recording:
         except KeyError:
             there = ", ".join("/".join(name) for name in self.streams) or "none"
             raise RecordingError(f"{self.path}: no stream {node}/{port}; there are {there}") from None
+
+    def streams_of(self, kind: type[Sample]) -> list[Stream]:
+        """The streams with samples of `kind`, ground truth aside."""
+        return [s for name, s in self.streams.items() if s.schema == kind.schema and s.count and name != TRUTH]
 
     def close(self) -> None:
         """Close the file; iterations under way end with an error."""

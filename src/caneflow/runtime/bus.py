@@ -55,6 +55,7 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
     """The flow ends: SIGTERM, or Ctrl-C."""
 
 
+Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
 Event: TypeAlias = Arrived | Marked | Started | Opened | Stopped
 
 
@@ -66,7 +67,7 @@ class Bus:
         self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._session = open_session(listen=plan.links.listen, connect=plan.links.connect, replay=plan.replay)
         # Whatever must outlive its statement: a liveliness token that no variable holds is undeclared at once.
-        self._held: list[object] = []
+        self._held: list[Held] = []
         self._listen()
         self._publishers = {port: self._publisher(out.key, out.schema) for port, out in plan.outputs.items()}
         self._progress = self._control_publisher("progress", plan.node)
@@ -78,6 +79,8 @@ class Bus:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        for held in self._held:  # first, or Zenoh reports what still comes for a session that is closing
+            held.undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
         self._session.close()  # type: ignore[no-untyped-call]  # the stub lacks its types
 
     def declare_ready(self) -> None:

@@ -13,7 +13,7 @@ from caneflow.runtime.topology import check_machines
 from caneflow.runtime.validation import Checked
 from caneflow.runtime.wiring import Part, check_wires, external_outputs, warn_of_unread
 from caneflow.runtime.wording import did_you_mean, listed, one_line, shown
-from caneflow.runtime.yaml_file import Document, compose, read_yaml
+from caneflow.runtime.yaml_file import MAX_DEPTH, Document, compose, read_yaml
 from caneflow.runtime.yaml_shape import FlowShape, NodeShape, RestartShape, is_written, read_shape
 
 GIVEN_RIG = "rig of the recording or --rig"
@@ -103,9 +103,10 @@ def _part(document: Document, name: str, shape: NodeShape, base: Path) -> Part:
                 document.problem(
                     (*path, key), "an external node publishes by itself; it has only outputs and machine", key=True
                 )
-        if not is_written(document.value, (*path, "outputs")):
+        if is_written(document.value, (*path, "outputs")):
+            part.outputs = external_outputs(document, name, shape)
+        else:
             document.problem((*path, "outputs"), "is missing; an external node names them, e.g. {imu: Imu}")
-        part.outputs = external_outputs(document, name, shape)
         return part
     if is_written(document.value, (*path, "outputs")):
         document.problem(
@@ -181,7 +182,7 @@ def _lay_over(document: Document, override: str) -> None:
     way, equals, text = override.partition("=")
     node, *keys = way.split(".")
     nodes = document.value.get("nodes")
-    if not equals or not keys or not all((node, *keys)):
+    if not equals or not keys or not all((node, *keys)) or len(keys) > MAX_DEPTH:
         document.problems.append(
             Problem(place=place, path="", text="is not NODE.KEY=VALUE, e.g. fusion.method=kalman")
         )

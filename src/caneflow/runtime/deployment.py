@@ -18,7 +18,8 @@ from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
 
 RECORDER = "recorder"
 TRUTH = ("truth", "pose")
-REPLAYER = "caneflow.drivers.replay"
+REPLAYER_MODULE = "caneflow.drivers.replay"
+RECORDER_MODULE = "caneflow.tools.record"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +154,7 @@ def _replayed(
     return NodePlan(
         flow=graph.flow,
         node=node.name,
-        module=REPLAYER,
+        module=REPLAYER_MODULE,
         settings=settings,
         seed=graph.seed,
         outputs=_outputs(graph.flow, node.name, kinds),
@@ -207,9 +208,7 @@ def _recorder(
         "source": "replayed" if replay else "live",
         "truth_from": str(replay.recording.resolve()) if replay and carries_truth else None,
     }
-    return NodePlan(
-        flow=graph.flow, node=RECORDER, module="caneflow.tools.record", settings=settings, inputs=inputs
-    )
+    return NodePlan(flow=graph.flow, node=RECORDER, module=RECORDER_MODULE, settings=settings, inputs=inputs)
 
 
 def _with_readers(plan: NodePlan, plans: dict[str, NodePlan], rig: dict[str, Any], replay: bool) -> NodePlan:

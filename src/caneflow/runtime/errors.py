@@ -29,7 +29,8 @@ class Problem:
 
     def __str__(self) -> str:
         parts = [str(self.place), "warning" if self.warning else "", self.path, self.text]
-        return ": ".join(part for part in parts if part)
+        text = ": ".join(part for part in parts if part)
+        return text.encode(errors="backslashreplace").decode()  # names from outside may be no text
 
 
 class DataflowError(CaneflowError):

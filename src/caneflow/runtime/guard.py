@@ -1,7 +1,7 @@
-"""Ends the processes of a flow when its launcher dies, however it dies. Standard library only: fast to start.
+"""Ends the processes of a flow when its launcher dies, however it dies. Standard library only.
 
-The launcher writes `+PGID` for each process group that it starts and `-PGID` for each that has ended. When the pipe
-closes, what is left is killed: a launcher that ends in good order has taken back every group before.
+The launcher writes `+PGID` for each process group that it starts and `-PGID` for each that has ended. When the
+pipe closes, what is left is killed: a launcher that ends in good order has taken back every group before.
 """
 
 import contextlib

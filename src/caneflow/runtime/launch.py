@@ -137,10 +137,6 @@ class Launcher:
                 history=True,
             ),
         ]
-        self._start_publisher = self._session.declare_publisher(control_key(flow, "start"))
-        self._window_publisher = self._session.declare_publisher(
-            control_key(flow, "window"), congestion_control=zenoh.CongestionControl.BLOCK
-        )
 
     def _hearing(self, kind: type[Progress] | type[Counters]) -> "zenoh.handlers.Callback[zenoh.Sample]":
         def put(sample: zenoh.Sample) -> None:
@@ -201,9 +197,7 @@ class Launcher:
         if not self._barrier_passed and all(other.state == "ready" for other in self._nodes.values()):
             self._barrier_passed = True
         if self._barrier_passed:
-            self._start_publisher.put(b"")
-            if self._until > BEGIN:
-                self._window_publisher.put(encode(Window(self._until)))
+            self._say_start()
 
     def _take_exit(self, node: NodeState, exited: Exited) -> None:
         if exited.pid != node.pid:
@@ -251,10 +245,21 @@ class Launcher:
         if not (self._barrier_passed and self._deployment.replay):
             return
         slowest = min((node.handled for node in self._nodes.values() if node.plan.inputs), default=END)
-        until = min(max(slowest, self._deployment.origin) + REPLAY_WINDOW, END)
-        if until >= self._until + REPLAY_WINDOW // 16 or (until == END and self._until < END):
+        if slowest >= END - 1:
+            return  # nobody needs a window any more, and sessions may be closing
+        until = max(slowest, self._deployment.origin) + REPLAY_WINDOW
+        if until >= self._until + REPLAY_WINDOW // 16:
             self._until = until
-            self._window_publisher.put(encode(Window(until)))
+            self._tell("window", encode(Window(until)))
+
+    def _say_start(self) -> None:
+        self._tell("start", b"")
+        if self._until > BEGIN:
+            self._tell("window", encode(Window(self._until)))
+
+    def _tell(self, what: str, payload: bytes) -> None:
+        key = control_key(self._deployment.flow, what)
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def _all_ended(self) -> bool:
         return all(node.handled == END for node in self._nodes.values())
@@ -274,18 +279,10 @@ class Launcher:
                     self._take_said(said)
 
     def _conclude(self) -> None:
-        """Sum the run up: in a replay, every loss is a failure."""
-        counters = {name: node.counters for name, node in self._nodes.items() if node.counters is not None}
-        self._outcome.counters = counters
-        if not self._deployment.replay or self._outcome.interrupted:
-            return
-        for name, counted in counters.items():
-            for port, counts in counted.inputs.items():
-                for what in ("lost", "late", "dropped"):
-                    if number := getattr(counts, what):
-                        self._outcome.failures.append(
-                            f"{name}.{port}: {number} samples {what}; the result is incomplete"
-                        )
+        nodes = self._nodes.items()
+        self._outcome.counters = {name: node.counters for name, node in nodes if node.counters is not None}
+        if self._deployment.replay and not self._outcome.interrupted:
+            note_losses(self._outcome)
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
@@ -298,3 +295,12 @@ class Launcher:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def note_losses(outcome: Outcome) -> None:
+    """In a replay every loss is a failure: the result would not be the recording's."""
+    for name, counters in outcome.counters.items():
+        for port, counts in counters.inputs.items():
+            for what in ("lost", "late", "dropped"):
+                if number := getattr(counts, what):
+                    outcome.failures.append(f"{name}.{port}: {number} samples {what}; the result is incomplete")

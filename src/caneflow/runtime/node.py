@@ -20,8 +20,8 @@ from caneflow.runtime.feed import Feed
 from caneflow.runtime.merge import BEGIN, END
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Operator, Program, Quiet, Sink, Source
-from caneflow.runtime.seeds import generator
 from caneflow.runtime.programs import validated_settings
+from caneflow.runtime.seeds import generator
 from caneflow.runtime.stage import Stage
 from caneflow.runtime.tap import Tap
 

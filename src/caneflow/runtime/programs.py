@@ -33,14 +33,15 @@ class Located(NamedTuple):
 
 
 def locate(run: str, base: Path) -> Located:
-    """Where the program `run` is; a path is taken from the folder `base`. Raises DataflowError if there is none."""
+    """Where the program `run` is, a path being taken from the folder `base`; raises DataflowError if nowhere."""
     if "/" in run or run.endswith(".py"):
         return Located(file=_file(run, base))
     if IN_A_ROOM.fullmatch(run) and importlib.util.find_spec(f"caneflow.{run}") is not None:
         return Located(module=f"caneflow.{run}")
     there = available()
+    hint = did_you_mean(run, there, likeness=0.75)  # all of them begin alike
     raise DataflowError(
-        f"no program {shown(run)} in {_looked_in()};{did_you_mean(run, there)} there are {listed(there)}; "
+        f"no program {shown(run)} in {_looked_in()};{hint} there are {listed(there)}; "
         "a program of your own is named by the path to its .py file"
     )
 
@@ -129,12 +130,11 @@ def _looked_in() -> str:
 
 
 def _imported(where: Located) -> ModuleType:
-    name = where.module or str(where.file)
     try:
         with redirect_stdout(sys.stderr):  # what a program prints is no answer of ours
-            return importlib.import_module(where.module) if where.module else _from_file(where.file)
+            return importlib.import_module(str(where.module)) if where.file is None else _from_file(where.file)
     except (Exception, SystemExit) as error:  # a program may do anything while it is imported
-        raise DataflowError(f"{name} cannot be imported: {_cause(error)}") from error
+        raise DataflowError(f"{where.file or where.module} cannot be imported: {_cause(error)}") from error
 
 
 def _from_file(file: Path) -> ModuleType:
@@ -173,7 +173,8 @@ def _none_in(run: str, unfinished: list[Program]) -> str:
 
 def _check_tables(run: str, program: Program) -> None:
     """Raise DataflowError unless ports and Settings of the class are what the runtime works with."""
-    for table, ports in (("inputs", inputs_of(program)), ("outputs", outputs_of(program))):
+    tables: dict[str, Any] = {"inputs": inputs_of(program), "outputs": outputs_of(program)}
+    for table, ports in tables.items():
         where = f"{shown(run)}: {program.__name__}.{table}"
         if not isinstance(ports, Mapping):
             raise DataflowError(f"{where} is no table of ports; that is e.g. {{'imu': Imu}}")

@@ -1,7 +1,7 @@
 """Checks the machines of a graph: that samples can reach every reader.
 
-Zenoh peers do not relay for peers, and say nothing about it: two machines that share a wire need a link of their own,
-which exactly one of the two dials.
+Zenoh peers do not relay for peers, and say nothing about it: two machines that share a wire need a link of their
+own, which exactly one of the two dials.
 """
 
 import ipaddress

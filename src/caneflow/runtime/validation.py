@@ -51,10 +51,16 @@ class Checked(Generic[T]):
 
     def takes(self, path: KeyPath) -> str:
         """What would be right at `path`, as words."""
-        schemas = self._at(path)
-        words = list(dict.fromkeys(filter(None, map(_takes, schemas))))
-        about = next((s["description"] for s in self._beside(path) if "description" in s), "")
-        return f"{' or '.join(words) or 'something else'}{f' ({about})' if about else ''}"
+        words = dict.fromkeys(filter(None, map(_takes, self._at(path))))
+        return " or ".join(words) or "something else"
+
+    def about(self, path: KeyPath) -> str:
+        """What the value at `path` means, with its unit; empty when the type does not say."""
+        return next((str(s["description"]) for s in self._beside(path) if "description" in s), "")
+
+    def _right(self, path: KeyPath) -> str:
+        about = self.about(path)
+        return f"it takes {self.takes(path)}{f' ({about})' if about else ''}"
 
     def _mistake(self, values: Any, detail: ErrorDetails) -> Mistake:
         kind = detail["type"]
@@ -63,15 +69,15 @@ class Checked(Generic[T]):
             path = (*path, *last)
             return Mistake(path, self._unknown(path), key=True)
         if kind in OWN_WORDS:
-            return Mistake(path, one_line(detail["ctx"]["error"]))
+            return _said_by_type(values, path, one_line(detail["ctx"]["error"]))
         if kind == "missing" and last and isinstance(last[0], str):
-            return Mistake((*path, *last), f"is missing; it takes {self.takes((*path, *last))}", key=True)
+            return Mistake((*path, *last), f"is missing; {self._right((*path, *last))}", key=True)
         if last == ("[key]",):
             return Mistake(path, f"is no name; that is {_key_rule(self._at(path[:-1]))}", key=True)
         value = _value_at(values, path)
         choice = next((s["enum"] for s in self._at(path) if "enum" in s), ())
         hint = did_you_mean(value, map(str, choice)) if isinstance(value, str) else ""
-        return Mistake(path, f"is {shown(value)};{f'{hint} it' if hint else ' it'} takes {self.takes(path)}")
+        return Mistake(path, f"is {shown(value)};{hint} {self._right(path)}")
 
     def _unknown_keys(self, values: Any, path: KeyPath = ()) -> Iterator[Mistake]:
         if isinstance(values, dict):
@@ -123,6 +129,13 @@ class Checked(Generic[T]):
             yield from self._alternatives(one)
 
 
+def is_inside(values: Any, key: int | str) -> bool:
+    """Whether a mapping or list has something at `key`."""
+    if isinstance(values, list):
+        return isinstance(key, int) and key < len(values)
+    return isinstance(values, dict) and key in values
+
+
 class _Lenient(GenerateJsonSchema):
     """Says nothing about a part of a type that JSON Schema has no words for, instead of giving up."""
 
@@ -138,12 +151,17 @@ def _path_in(values: Any, loc: tuple[int | str, ...]) -> tuple[KeyPath, KeyPath]
     path: list[int | str] = []
     for key in loc:
         inside = _value_at(values, tuple(path))
-        if (isinstance(inside, dict) and key in inside) or (
-            isinstance(inside, list) and isinstance(key, int) and key < len(inside)
-        ):
+        if is_inside(inside, key):
             path.append(key)
     there = len(path) > 0 and loc[-1] == path[-1]
     return tuple(path), (() if there or not loc else (loc[-1],))
+
+
+def _said_by_type(values: Any, path: KeyPath, text: str) -> Mistake:
+    """The sentence of a type's own check, moved to the key that it begins with."""
+    name, _, rest = text.partition(" ")
+    name = name.removesuffix(":")
+    return Mistake((*path, name), rest) if is_inside(_value_at(values, path), name) else Mistake(path, text)
 
 
 def _value_at(values: Any, path: KeyPath) -> Any:
@@ -189,11 +207,15 @@ def _takes(schema: JsonSchema) -> str:
 
 def _bounds(schema: JsonSchema) -> str:
     words = {
+        "multipleOf": "a multiple of",
         "exclusiveMinimum": "above",
-        "minimum": "of at least",
+        "minimum": "at least",
         "exclusiveMaximum": "below",
-        "maximum": "of at most",
-        "multipleOf": "that is a multiple of",
+        "maximum": "at most",
     }
-    bounds = [f"{word} {schema[key]:g}" for key, word in words.items() if key in schema]
-    return f" {' and '.join(bounds)}" if bounds else ""
+    bounds = [f"{word} {_number(schema[key])}" for key, word in words.items() if key in schema]
+    return f", {' and '.join(bounds)}" if bounds else ""
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value == int(value) and abs(value) < 1e12 else f"{value:g}"

@@ -1,4 +1,4 @@
-"""Checks the wires of a graph: that each leads from an output that is there to an input that takes its messages."""
+"""Checks the wires of a graph: each leads from an output that is there to an input that takes its messages."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

@@ -33,7 +33,7 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
-def did_you_mean(word: str, names: Iterable[str]) -> str:
-    """` did you mean 'x'?` for the closest of `names`, or nothing when none is close."""
-    close = get_close_matches(word, list(names), n=1)
+def did_you_mean(word: str, names: Iterable[str], *, likeness: float = 0.6) -> str:
+    """` did you mean 'x'?` for the closest of `names`, or nothing when none is as close as `likeness` (0..1)."""
+    close = get_close_matches(word, list(names), n=1, cutoff=likeness)
     return f" did you mean {close[0]!r}?" if close else ""

@@ -1,7 +1,7 @@
 """A YAML text as plain values, each with its line and column; what YAML itself gets wrong becomes problems.
 
-Values are composed here instead of by a YAML loader, because loaders stop at the first double key, build objects out
-of tags, and forget where a value stood.
+Values are composed here instead of by a YAML loader, because loaders stop at the first double key, build objects
+out of tags, and forget where a value stood.
 """
 
 import math
@@ -19,6 +19,7 @@ from caneflow.runtime.errors import DataflowError, Place, Problem
 from caneflow.runtime.wording import KeyPath, dotted, one_line, shown
 
 MAX_BYTES = 2**20  # a graph of hundreds of nodes has 100 kB
+MAX_DEPTH = 32  # mappings and lists inside each other
 MAX_VALUES = 50_000  # aliases of aliases may stand for more values than fit into memory
 
 TAG = "tag:yaml.org,2002:"
@@ -40,13 +41,16 @@ class Document:
         self._laid_over: dict[KeyPath, Place] = {}
 
     def place(self, path: KeyPath, *, key: bool = False) -> Place:
-        """Where the value at `path` (or its key) was written; for what is not there, the nearest thing above it."""
+        """Where the value at `path` (or its key) was written; the nearest thing above it if it is not there."""
         for end in range(len(path), -1, -1):
             if (over := self._laid_over.get(path[:end])) is not None:
                 return over
         exact = (self.key_places if key else self.places).get(path)
         if exact is not None:
             return exact
+        for laid, over in self._laid_over.items():
+            if laid[: len(path)] == path:
+                return over
         for end in range(len(path), 0, -1):
             if (above := self.key_places.get(path[:end]) or self.places.get(path[:end])) is not None:
                 return above
@@ -117,7 +121,7 @@ def compose(text: str, source: str) -> Document:
         )
         raise _broken(place, f"is no YAML: character {ord(text[error.position]):#06x} is not allowed") from error
     except RecursionError as error:
-        raise _broken(Place(source=source, line=1, column=1), "is nested too deeply") from error
+        raise _broken(Place(source=source, line=1, column=1), f"is nested more than {MAX_DEPTH} deep") from error
     except _TooMuch as error:
         raise _broken(Place(source=source, line=1, column=1), str(error)) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, AssertionError) as error:
@@ -144,6 +148,8 @@ class _Plain:
         self._count += 1
         if self._count > MAX_VALUES:
             raise _TooMuch(f"stands for more than {MAX_VALUES} values; that is no dataflow")
+        if len(path) > MAX_DEPTH:
+            raise _TooMuch(f"is nested more than {MAX_DEPTH} deep; that is no dataflow")
         self._document.places[path] = self._place(node)
         if id(node) in self._open:
             self._document.refuse(path, "contains itself; an alias may not lead to what it stands in")

@@ -11,13 +11,13 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSche
 
 from caneflow.messages import NAME, NAME_RULE
 from caneflow.messages.rig import Rig
-from caneflow.runtime.validation import Checked, Mistake
+from caneflow.runtime.validation import Checked, Mistake, is_inside
 from caneflow.runtime.wording import KeyPath
 
 NAME_PATTERN = f"^{NAME.pattern}$"
 STREAM_PATTERN = f"^{NAME.pattern}/{NAME.pattern}$"
 QUEUE_PATTERN = "^(latest|all|fifo [1-9][0-9]{0,5})$"
-ENDPOINT_PATTERN = r"^(tcp|tls|quic|ws)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}$"
+ENDPOINT_PATTERN = r"^tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}$"
 
 ALL_LENGTH = 4096  # samples that may wait on an input that takes `all`: 40 s at 100 Hz
 
@@ -112,7 +112,7 @@ Restart = Annotated[
     _short_or(
         {"type": "string", "enum": ["never", "on-failure", "always"]},
         RestartShape,
-        "what becomes of the node when its process ends; a mapping says how often and how fast",
+        "what becomes of the node when its process ends (left out: on-failure); a mapping says how fast",
     ),
 ]
 
@@ -125,7 +125,8 @@ class NodeShape(Shape):
         Field(
             default_factory=str,
             examples=["drivers.bno055", "operators.fusion", "my/own.py"],
-            description="the program: a module of caneflow, or a path (from this file) to a Python file",
+            description="the program: a module of caneflow, or a path (from this file) to a Python file; "
+            "an external node has none",
         ),
     ]
     machine: Annotated[Name | None, Field(description="one of `machines`; needed when there are several")] = None
@@ -159,7 +160,7 @@ class FlowShape(Shape):
         ),
     ]
     seed: Annotated[
-        int, Field(ge=0, le=2**63 - 1, description="where all random numbers of the flow come from")
+        int, Field(ge=0, le=2**32 - 1, description="where all random numbers of the flow come from")
     ] = 0
     rig: Annotated[Rig, Field(default_factory=Rig, description="what is bolted on")]
     machines: Annotated[
@@ -201,18 +202,17 @@ def is_written(values: Any, path: KeyPath) -> bool:
 def _nearest(values: Any, path: KeyPath) -> KeyPath:
     """`path`, as far as it leads through `values`."""
     for i, key in enumerate(path):
-        if (isinstance(values, dict) and key in values) or (
-            isinstance(values, list) and isinstance(key, int) and key < len(values)
-        ):
-            values = values[key]
-        else:
+        if not is_inside(values, key):
             return path[:i]
+        values = values[key]
     return path
 
 
 def _take_out(values: Any, path: KeyPath) -> None:
-    """Delete what stands at `path`, unless it went with something else."""
-    if path and _nearest(values, path) == path:
+    """Delete what stands at `path`, unless it went with something else; all of it for the empty path."""
+    if not path:
+        values.clear()
+    elif _nearest(values, path) == path:
         for key in path[:-1]:
             values = values[key]
-        del values[path[-1]]
+        values.pop(path[-1])

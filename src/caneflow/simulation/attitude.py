@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 
+DEGREE = np.pi / 180.0  # rad
+
 
 def from_angles(yaw: Floats, pitch: Floats, roll: Floats) -> Floats:
     """Quaternions of shape (n, 4) for yaw, pitch and roll of shape (n,), rad."""
@@ -36,7 +38,8 @@ def multiply(left: Floats, right: Floats) -> Floats:
 
 def conjugate(orientation: Floats) -> Floats:
     """The inverse rotations, shape (n, 4)."""
-    return orientation * np.array([1.0, -1.0, -1.0, -1.0])
+    inverse: Floats = orientation * np.array([1.0, -1.0, -1.0, -1.0])
+    return inverse
 
 
 def rotate(orientation: Floats, vector: ArrayLike) -> Floats:
@@ -59,13 +62,15 @@ def to_rotation_vector(orientation: Floats) -> Floats:
     sine = np.linalg.norm(short[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, short[..., :1])
     # angle / sin(angle / 2) tends to 2 where the quotient is 0 / 0
-    return short[..., 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-12)
+    vector: Floats = short[..., 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-12)
+    return vector
 
 
 def yaw_of(orientation: Floats) -> Floats:
     """Yaw (rad, -pi..pi) of the body's y axis, (n, 4) to (n,)."""
     w, x, y, z = np.moveaxis(orientation, -1, 0)
-    return np.arctan2(1.0 - 2.0 * (x * x + z * z), 2.0 * (x * y - w * z))
+    yaw: Floats = np.arctan2(1.0 - 2.0 * (x * x + z * z), 2.0 * (x * y - w * z))
+    return yaw
 
 
 def _about(axis: int, angle: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""A BNO055 class IMU in fusion mode: what the chip reports of a motion, at 100 Hz, with errors and steps of the chip.
+"""A BNO055 class IMU in fusion mode: what the chip reports of a motion at 100 Hz, with its errors and its steps.
 
 Data sheet: Bosch BST-BNO055-DS000-14. The rows marked cane.md are what is left after the chip's own calibration.
 """
@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from caneflow.simulation import attitude
-from caneflow.simulation.attitude import Floats
+from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.walk import RATE, Motion
 
 GRAVITY = 9.81  # m/s^2, as wire.md has it at rest
@@ -26,16 +26,16 @@ NotNegative = Annotated[float, Ge(0)]
 class ImuSettings:
     """Errors of the chip and of the field around it."""
 
-    gyro_noise: NotNegative = np.deg2rad(0.014)  # rad/s/sqrt(Hz) (cane.md; data sheet table 0-2)
-    gyro_bias: NotNegative = np.deg2rad(0.05)  # rad/s, sd per axis (cane.md)
+    gyro_noise: NotNegative = 0.014 * DEGREE  # rad/s/sqrt(Hz) (cane.md; data sheet table 0-2)
+    gyro_bias: NotNegative = 0.05 * DEGREE  # rad/s, sd per axis (cane.md)
     gyro_scale: NotNegative = 0.007  # sd per axis (cane.md)
     accel_noise: NotNegative = 190e-6 * GRAVITY  # m/s^2/sqrt(Hz) (cane.md; data sheet table 0-2)
     accel_bias: NotNegative = 0.07  # m/s^2, sd per axis (cane.md)
     mag_noise: NotNegative = 0.3  # uT, sd per axis: the data sheet's resolution of the magnetometer
-    tilt_error: NotNegative = np.deg2rad(0.26)  # rad, sd about each horizontal axis (cane.md)
+    tilt_error: NotNegative = 0.26 * DEGREE  # rad, sd about each horizontal axis (cane.md)
     tilt_time: Annotated[float, Gt(0)] = 8.0  # s (cane.md)
     heading_time: Annotated[float, Gt(0)] = 5.0  # s in which the heading is pulled to the field (cane.md)
-    field_error: NotNegative = np.deg2rad(10.0)  # rad, sd of the field's direction indoors (cane.md)
+    field_error: NotNegative = 10.0 * DEGREE  # rad, sd of the field's direction indoors (cane.md)
     field_scale: Annotated[float, Gt(0)] = 2.0  # m over which it errs (cane.md)
 
 
@@ -53,7 +53,7 @@ class ImuSamples(NamedTuple):
 SAMPLE_RATE = 100  # Hz of the fusion's outputs (data sheet table 3-14)
 _EVERY = RATE // SAMPLE_RATE
 
-GYRO_STEP = np.deg2rad(1.0 / 16.0)  # rad/s, default units (data sheet table 3-22)
+GYRO_STEP = DEGREE / 16.0  # rad/s, default units (data sheet table 3-22)
 ACCEL_STEP = 0.01  # m/s^2 (data sheet p. 30)
 MAG_STEP = 1.0 / 16.0  # uT (data sheet p. 30)
 QUATERNION_STEP = 2.0**-14  # (data sheet p. 36)
@@ -139,8 +139,8 @@ def _fusion(
 ) -> Floats:
     """Orientation as the chip's fusion has it, before rounding, (n, 4).
 
-    Heading: the gyro's turning, error and all, pulled towards the compass. The field's direction is taken for north,
-    so a field that is turned to the left makes a heading that errs to the right. The chip has been on for long.
+    Heading: the gyro's turning, error and all, pulled towards the compass. The field's direction is taken for
+    north, so a field turned to the left makes a heading that errs to the right. The chip has been on for long.
     """
     compass_error = np.arctan2(field[:, 0], field[:, 1])
     kept = np.exp(-1.0 / SAMPLE_RATE / settings.heading_time)
@@ -156,7 +156,7 @@ def _fusion(
 
 
 def _calibration(field: Floats) -> NDArray[np.int64]:
-    """Levels 0..3. Bosch does not say how; here the magnetometer's falls where the field is not as strong as usual."""
+    """Levels 0..3. Bosch does not say how; here the magnetometer's falls where the field's strength is unusual."""
     strength = np.linalg.norm(field, axis=1) / np.linalg.norm(EARTH_FIELD)
     mag = 3 - np.searchsorted([0.1, 0.2, 0.4], np.abs(strength - 1.0))
     full = np.full_like(mag, 3)
@@ -165,7 +165,8 @@ def _calibration(field: Floats) -> NDArray[np.int64]:
 
 def _white(count: int, density: float, rng: Generator) -> Floats:
     """Noise (count, 3) of a one-sided spectral `density`, unit per sqrt(Hz), up to half of the sample rate."""
-    return rng.normal(0.0, 1.0, (count, 3)) * density * np.sqrt(0.5 * SAMPLE_RATE)
+    noise: Floats = rng.normal(0.0, 1.0, (count, 3)) * density * np.sqrt(0.5 * SAMPLE_RATE)
+    return noise
 
 
 def _low_passed(signal: Floats, band: float) -> Floats:

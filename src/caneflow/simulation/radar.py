@@ -1,13 +1,14 @@
 """A P440 class pulse radar: scans of a scene, one real-valued scan per pose.
 
 Letters: R range of a scatterer, r range of a bin (both m), f carrier (Hz), c speed of light, k = 4 pi f / c.
-A scatterer of complex amplitude a adds Re{a G(theta) / R^2 p(r - R) exp(j k (r - R))}: power falls as R^-4, G is the
-two-way pattern, p the Gaussian envelope of the pulse. As R falls, the phase at a given r rises: in the analytic
-signal along r, approaching is positive Doppler (wire.md).
+A scatterer of complex amplitude a adds Re{a G(theta) / R^2 p(r - R) exp(j k (r - R))}: power falls as R^-4, G is
+the two-way pattern, p the Gaussian envelope of the pulse. As R falls, the phase at a given r rises: in the
+analytic signal along r, approaching is positive Doppler (wire.md).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated
 
 import numpy as np
@@ -24,7 +25,7 @@ BORESIGHT = (0.0, 1.0, 0.0)  # of the radar in the body frame, as in the paper
 LIGHT = 299_792_458.0  # m/s
 RANGE_STEP = 0.5 * LIGHT * 32.0 / 512e9 / 1.024  # m, 61.035 ps: 32 bins of 1 / (512 x 1.024) ns (MRM protocol)
 
-_BLOCK = 32  # scans at a time: the arrays stay in the cache
+_BLOCK = 16  # scans at a time: the arrays stay in the cache
 _FINER = 2  # cells per range bin on which echoes are added up; linear between cells costs -57 dB
 _FAINT = 0.02  # one-way power gain below which a scatterer is left out: -34 dB two-way
 
@@ -44,14 +45,15 @@ class RadarSettings:
     snr: float = 15.0  # dB
     noise: Annotated[float, Gt(0)] = 200.0  # LSB, white up to 8.2 GHz: a P440's recorded scans (p440-rail-mocap)
     jitter: Annotated[float, Ge(0)] = 0.15e-12  # s, sd per scan: that recording's strongest echo while it stands
-    # Direct coupling: an antenna's ring-down, above the strongest floor echo at bin 0 and dying away, both chosen
+    # Direct coupling: an antenna's ring-down, at its strongest above the strongest floor echo; both chosen
     coupling: float = 26.0  # dB
     coupling_decay: Annotated[float, Gt(0)] = 0.06  # m per factor e of amplitude
     tip_section: Annotated[float, Ge(0)] = 0.003  # m^2, chosen: a tip and a shaft seen from behind, -25 dBsm
 
     def ranges(self) -> Floats:
         """Range of each bin, (bins,) m."""
-        return self.range_start + RANGE_STEP * np.arange(self.bins)
+        ranges: Floats = self.range_start + RANGE_STEP * np.arange(self.bins, dtype=np.float64)
+        return ranges
 
 
 def scans(
@@ -65,8 +67,8 @@ def scans(
 ) -> NDArray[np.int32]:
     """Scans (n, bins), LSB, one per sample of `motion`; nothing moves within a scan.
 
-    `pitch` (rad) is the cane's nominal attitude, on which the SNR is defined. The scans of a shorter motion are the
-    beginning of those of the longer one. `progress` is told the part done, 0..1.
+    `pitch` (rad) is the cane's nominal attitude, on which the SNR is defined. The scans of a shorter motion are
+    the beginning of those of the longer one. `progress` is told the part done, 0..1.
     """
     leak_rng, noise_rng = rng.spawn(2)
     floor = float(floor_power(rig, pitch, scene.floor_reflectivity, settings).max())
@@ -104,30 +106,33 @@ def echoes(
 ) -> Complexes:
     """Noise-free echoes as analytic signals (n, bins), in 1/m: the real part is what a receiver samples.
 
-    `antenna` (n, 3) m, `boresight` (n, 3) unit vectors, `points` (k, 3) m, or (n, k, 3) where they move, `amplitudes`
-    (k,) m, `aperture` the full -3 dB angle of the one-way pattern, rad.
+    `antenna` (n, 3) m, `boresight` (n, 3) unit vectors, `points` (k, 3) m, or (n, k, 3) where they move,
+    `amplitudes` (k,) m, `aperture` the full -3 dB angle of the one-way pattern, rad.
     """
     dx = points[..., 0] - antenna[:, :1]
     dy = points[..., 1] - antenna[:, 1:2]
     dz = points[..., 2] - antenna[:, 2:]
     distance = np.sqrt(dx * dx + dy * dy + dz * dz)
     cosine = (dx * boresight[:, :1] + dy * boresight[:, 1:2] + dz * boresight[:, 2:]) / distance
-    strength = pattern(np.arccos(np.clip(cosine, -1.0, 1.0)), aperture) / distance**2
-    phase = -_wave_number(settings) * distance
+    strength = pattern(np.arccos(np.clip(cosine, -1.0, 1.0)), aperture) / distance**2 * np.abs(amplitudes)
     cells = _cells(settings)
     index = (distance - cells[0]) * (_FINER / RANGE_STEP)
     strength[(index < 0.0) | (index >= len(cells) - 1)] = 0.0
     index = np.clip(index, 0.0, len(cells) - 2)
     lower = index.astype(np.intp)
-    upper_share = index - lower
     flat = (lower + len(cells) * np.arange(len(antenna))[:, None]).ravel()
-    received = amplitudes * strength * (np.cos(phase) + 1j * np.sin(phase))
-    summed = np.zeros((len(antenna), len(cells)), dtype=np.complex128)
-    for shift, share in ((0, 1.0 - upper_share), (1, upper_share)):
-        for part, weights in ((summed.real, received.real), (summed.imag, received.imag)):
-            added = np.bincount(flat + shift, weights=(weights * share).ravel(), minlength=summed.size)
-            part += added.reshape(summed.shape)
-    return _pulsed(summed, cells, settings)
+    index -= lower
+    # within one turn single precision is plenty (1e-7 rad), and twenty times as fast
+    turns = np.angle(amplitudes) / (2.0 * np.pi) - _wave_number(settings) / (2.0 * np.pi) * distance
+    phase = (2.0 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    summed = np.zeros((2, len(antenna), len(cells)))
+    for part, wave in zip(summed, (np.cos(phase), np.sin(phase)), strict=True):
+        to_lower = wave * strength
+        to_upper = to_lower * index
+        to_lower -= to_upper
+        for shift, share in ((0, to_lower), (1, to_upper)):
+            part += np.bincount(flat + shift, share.ravel(), part.size).reshape(part.shape)
+    return _pulsed(summed, settings)
 
 
 def pattern(angle: Floats, aperture: float) -> Floats:
@@ -135,7 +140,8 @@ def pattern(angle: Floats, aperture: float) -> Floats:
 
     The one-way power is down by 3 dB at half of `aperture`; two ways of it, as amplitude, are the same number.
     """
-    return np.asarray(np.exp(-4.0 * np.log(2.0) * (angle / aperture) ** 2), dtype=np.float64)
+    gain: Floats = np.exp(-4.0 * np.log(2.0) * (angle / aperture) ** 2)
+    return gain
 
 
 def floor_power(rig: Rig, pitch: float, reflectivity: float, settings: RadarSettings) -> Floats:
@@ -158,7 +164,8 @@ def floor_power(rig: Rig, pitch: float, reflectivity: float, settings: RadarSett
     density = pattern(np.arccos(np.clip(cosine, -1.0, 1.0)), rig.aperture) ** 2 / distance**4 * area
     edges = np.append(cells, cells[-1] + RANGE_STEP / _FINER) - 0.5 * RANGE_STEP / _FINER
     per_cell = np.histogram(distance.ravel(), edges, weights=density.sum(axis=1))[0]
-    return np.asarray(0.5 * reflectivity * per_cell @ _envelope(cells, settings) ** 2, dtype=np.float64)
+    power: Floats = 0.5 * reflectivity * per_cell @ _envelope(settings) ** 2
+    return power
 
 
 def _standing(rig: Rig, pitch: float, floor: float, settings: RadarSettings, rng: Generator) -> Complexes:
@@ -167,18 +174,20 @@ def _standing(rig: Rig, pitch: float, floor: float, settings: RadarSettings, rng
     `floor` is the amplitude of the strongest floor echo.
     """
     cells = _cells(settings)
-    taps = np.zeros(len(cells), dtype=np.complex128)
-    # one tap per 3 cm, nearer than a pulse is long: a ring-down of random phase
+    # a ring-down of random phase: one tap per 3 cm, nearer than a pulse is long
+    ringing = np.zeros(len(cells), dtype=np.complex128)
     every = round(0.03 * _FINER / RANGE_STEP)
-    phases = rng.uniform(0.0, 2.0 * np.pi, len(taps[::every]))
-    fall = np.exp(-(cells[::every] - settings.range_start) / settings.coupling_decay)
-    taps[::every] = floor * 10.0 ** (settings.coupling / 20.0) * fall * np.exp(1j * phases)
+    phases = rng.uniform(0.0, 2.0 * np.pi, len(cells[::every]))
+    ringing[::every] = np.exp(1j * phases - cells[::every] / settings.coupling_decay)
+    coupling = _pulsed(np.stack([ringing.real, ringing.imag]), settings)
+    coupling *= floor * 10.0 ** (settings.coupling / 20.0) / np.abs(coupling).max()
     # the cane is as long as it takes for its tip to touch the floor in front of the walker
-    tip = rig.hand_height / np.sin(pitch) - float(np.linalg.norm(rig.pivot))
-    if cells[0] < tip < cells[-1]:
+    reach = rig.hand_height / np.sin(pitch) - float(np.linalg.norm(rig.pivot))
+    tip = np.zeros(len(cells), dtype=np.complex128)
+    if cells[0] < reach < cells[-1]:
         phase = rng.uniform(0.0, 2.0 * np.pi)
-        taps[np.searchsorted(cells, tip)] += np.sqrt(settings.tip_section) / tip**2 * np.exp(1j * phase)
-    return _pulsed(taps, cells, settings)
+        tip[np.searchsorted(cells, reach)] = np.sqrt(settings.tip_section) / reach**2 * np.exp(1j * phase)
+    return coupling + _pulsed(np.stack([tip.real, tip.imag]), settings)
 
 
 def _seen(
@@ -187,24 +196,26 @@ def _seen(
     """The scatterers that may be within range and beam during a block that begins here."""
     offset = scene.points - antenna
     distance = np.linalg.norm(offset, axis=1)
-    # within 0.3 s a cane moves less than half a metre and turns less than 0.4 rad
-    widest = rig.aperture * np.sqrt(-np.log(_FAINT) / (4.0 * np.log(2.0))) + 0.4
-    kept = (distance < _cells(settings)[-1] + 0.5) & (offset @ boresight > distance * np.cos(widest))
+    # within a block, 0.16 s, a cane moves less than 0.3 m and turns less than 0.3 rad
+    widest = rig.aperture * np.sqrt(-np.log(_FAINT) / (4.0 * np.log(2.0))) + 0.3
+    kept = (distance < _cells(settings)[-1] + 0.3) & (offset @ boresight > distance * np.cos(widest))
     return scene.points[kept], scene.amplitudes[kept]
 
 
-def _pulsed(summed: Complexes, cells: Floats, settings: RadarSettings) -> Complexes:
-    """Echoes per cell (..., cells), phase at the scatterer, as analytic signals over the bins (..., bins)."""
-    envelope = _envelope(cells, settings)
-    shaped = summed.real @ envelope + 1j * (summed.imag @ envelope)
-    return shaped * np.exp(1j * _wave_number(settings) * settings.ranges())
+def _pulsed(summed: Floats, settings: RadarSettings) -> Complexes:
+    """Analytic signals (..., bins) of what is in each cell, (2, ..., cells): its real and its imaginary part."""
+    real, imaginary = summed @ _envelope(settings)
+    carried: Complexes = (real + 1j * imaginary) * np.exp(1j * _wave_number(settings) * settings.ranges())
+    return carried
 
 
-def _envelope(cells: Floats, settings: RadarSettings) -> Floats:
+@cache
+def _envelope(settings: RadarSettings) -> Floats:
     """Envelope of the pulse at each bin (columns) for an echo in each cell (rows)."""
-    return np.asarray(
-        np.exp(-0.5 * ((settings.ranges() - cells[:, None]) / pulse_length(settings)) ** 2), dtype=np.float64
-    )
+    offset = settings.ranges() - _cells(settings)[:, None]
+    envelope: Floats = np.exp(-0.5 * (offset / pulse_length(settings)) ** 2)
+    envelope.flags.writeable = False
+    return envelope
 
 
 def pulse_length(settings: RadarSettings) -> float:
@@ -217,7 +228,8 @@ def _cells(settings: RadarSettings) -> Floats:
     """Ranges (m) on which echoes are added up: finer than the bins, and a pulse more at each end."""
     beyond = round(4.0 * pulse_length(settings) / RANGE_STEP)
     count = _FINER * (settings.bins + 2 * beyond)
-    return settings.range_start + RANGE_STEP * (np.arange(count) / _FINER - beyond)
+    cells: Floats = settings.range_start + RANGE_STEP * (np.arange(count) / _FINER - beyond)
+    return cells
 
 
 def _wave_number(settings: RadarSettings) -> float:

@@ -1,9 +1,10 @@
 """Named walks with a white cane, and everything that its sensors and the truth say about one.
 
-`simulate_walk("swing", seed=1)` is the paper's walk. A scenario is a function from a Generator to settings, so that
-what differs from walk to walk (direction, where the stops are, in `varied` nearly everything) comes from the seed.
+`simulate_walk("swing", seed=1)` is the paper's walk. A scenario is a function from a Generator to settings, so
+that what differs from walk to walk (direction, where the stops are, nearly all of `varied`) comes from the seed.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -12,8 +13,8 @@ import numpy as np
 from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
-from caneflow.simulation.attitude import Floats
-from caneflow.simulation.imu import SAMPLE_RATE, ImuSettings, measure
+from caneflow.simulation.attitude import DEGREE, Floats
+from caneflow.simulation.imu import SAMPLE_RATE, ImuSamples, ImuSettings, measure
 from caneflow.simulation.radar import RANGE_STEP, RadarSettings, scans
 from caneflow.simulation.scene import SceneSettings, scene
 from caneflow.simulation.walk import RATE, Motion, MotionSettings, Pause, Rig, course_of, walk
@@ -37,17 +38,12 @@ class Walk:
     """n instants at 100 Hz: one IMU sample, one scan and one true pose each. Frames and units as in wire.md."""
 
     stamps_ns: NDArray[np.int64]  # (n,)
+    imu: ImuSamples
 
-    gyro: Floats  # (n, 3) rad/s, body
-    accel: Floats  # (n, 3) m/s^2, body
-    mag: Floats  # (n, 3) uT, body
-    imu_orientation: Floats  # (n, 4), of the chip's own fusion
-    linear_accel: Floats  # (n, 3) m/s^2, body
-    calibration: NDArray[np.int64]  # (n, 4)
-
+    # the truth
     position: Floats  # (n, 3) m, of the IMU's origin in R0
     velocity: Floats  # (n, 3) m/s, R0
-    orientation: Floats  # (n, 4), true
+    orientation: Floats  # (n, 4)
 
     scans: NDArray[np.int32]  # (n, bins) LSB
     scan_period: float  # s
@@ -77,21 +73,16 @@ def simulate_walk(
     _, person_rng, scene_rng, radar_rng, imu_rng = _generators(seed)
     motion = walk(settings.motion, settings.rig, person_rng, duration)
     room = scene(settings.scene, course_of(settings.motion), scene_rng)
-    imu = measure(motion, settings.imu, imu_rng)
     sampled = Motion(*(values[:: RATE // SAMPLE_RATE] for values in motion))
+    received = scans(sampled, room, settings.rig, settings.motion.pitch, settings.radar, radar_rng, progress)
     period_ns = 1_000_000_000 // SAMPLE_RATE
     return Walk(
         stamps_ns=EPOCH_NS + period_ns * np.arange(len(sampled.time), dtype=np.int64),
-        gyro=imu.gyro,
-        accel=imu.accel,
-        mag=imu.mag,
-        imu_orientation=imu.orientation,
-        linear_accel=imu.linear_accel,
-        calibration=imu.calibration,
+        imu=measure(motion, settings.imu, imu_rng),
         position=sampled.position,
         velocity=sampled.velocity,
         orientation=sampled.orientation,
-        scans=scans(sampled, room, settings.rig, settings.motion.pitch, settings.radar, radar_rng, progress),
+        scans=received,
         scan_period=1.0 / SAMPLE_RATE,
         range_start=settings.radar.range_start,
         range_step=RANGE_STEP,
@@ -117,29 +108,29 @@ def _generators(seed: int) -> list[Generator]:
 
 def _swing(rng: Generator) -> WalkSettings:
     """The paper's first experiment: a swing at each step, either way round."""
-    return WalkSettings(motion=MotionSettings(clockwise=_coin(rng)))
+    return WalkSettings(motion=_motion(rng))
 
 
 def _swing_stop(rng: Generator) -> WalkSettings:
     """The paper's second one: the swing is stopped midway."""
-    return _moved(_swing(rng), swing_until=rng.uniform(0.4, 0.6))
+    return WalkSettings(motion=replace(_motion(rng), swing_until=rng.uniform(0.4, 0.6)))
 
 
 def _stops(rng: Generator) -> WalkSettings:
     """The walker stands still twice."""
-    settings = _swing(rng)
-    length = course_of(settings.motion).length
+    motion = _motion(rng)
+    length = course_of(motion).length
     first = Pause(at=length * rng.uniform(0.15, 0.45), duration=rng.uniform(3.0, 5.0))
     second = Pause(at=length * rng.uniform(0.55, 0.85), duration=rng.uniform(3.0, 5.0))
-    return _moved(settings, pauses=(first, second))
+    return WalkSettings(motion=replace(motion, pauses=(first, second)))
 
 
 def _hard(rng: Generator) -> WalkSettings:
     """Walls, a person who walks by, few scatterers on the floor, 5 dB, and one stop."""
-    settings = _swing(rng)
-    stop = Pause(at=course_of(settings.motion).length * rng.uniform(0.3, 0.7), duration=rng.uniform(3.0, 4.0))
-    return replace(
-        _moved(settings, pauses=(stop,)),
+    motion = _motion(rng)
+    stop = Pause(at=course_of(motion).length * rng.uniform(0.3, 0.7), duration=rng.uniform(3.0, 4.0))
+    return WalkSettings(
+        motion=replace(motion, pauses=(stop,)),
         scene=SceneSettings(floor_density=25.0, walls=True, person=True),
         radar=RadarSettings(snr=5.0),
     )
@@ -152,7 +143,7 @@ def _varied(rng: Generator) -> WalkSettings:
     """
     rig = Rig(
         hand_height=rng.uniform(0.85, 1.05),
-        aperture=np.deg2rad(rng.uniform(40.0, 60.0)),
+        aperture=DEGREE * rng.uniform(40.0, 60.0),
         pivot=(0.0, -rng.uniform(0.2, 0.4), 0.0),
         antenna=(rng.uniform(-0.02, 0.02), rng.uniform(0.0, 0.05), rng.uniform(-0.02, 0.02)),
     )
@@ -172,50 +163,51 @@ def _varied(rng: Generator) -> WalkSettings:
         sway=rng.uniform(0.01, 0.035),
         pauses=(stop,) if _coin(rng) else (),
         hand_ahead=rng.uniform(0.25, 0.45),
-        swing=np.deg2rad(rng.uniform(10.0, 28.0)),
+        swing=DEGREE * rng.uniform(10.0, 28.0),
         swing_until=rng.uniform(0.3, 0.8) if _coin(rng) else None,
-        pitch=np.deg2rad(rng.uniform(38.0, 50.0)),
-        wander=np.deg2rad(rng.uniform(1.0, 3.0)),
+        pitch=DEGREE * rng.uniform(38.0, 50.0),
+        wander=DEGREE * rng.uniform(1.0, 3.0),
         restlessness=rng.uniform(1.0, 4.0),
     )
     return WalkSettings(
         rig=rig,
         motion=motion,
         scene=SceneSettings(
-            floor_density=np.exp(rng.uniform(np.log(40.0), np.log(400.0))),
+            floor_density=_spread(rng, 40.0, 400.0),
             walls=_coin(rng),
             person=_coin(rng),
         ),
         radar=RadarSettings(snr=rng.uniform(8.0, 18.0)),
-        imu=ImuSettings(gyro_bias=np.deg2rad(np.exp(rng.uniform(np.log(0.02), np.log(0.3))))),
+        imu=ImuSettings(gyro_bias=DEGREE * _spread(rng, 0.02, 0.3)),
     )
 
 
 def _straight(rng: Generator) -> WalkSettings:
     """An open path of 22 m: what a loop hides, it shows."""
-    return _moved(_swing(rng), shape="straight", length=22.0)
+    return WalkSettings(motion=replace(_motion(rng), shape="straight", length=22.0))
 
 
 def _figure_eight(rng: Generator) -> WalkSettings:
     """A lying eight of 8 x 3 m: left turns undo right turns."""
-    return _moved(_swing(rng), shape="figure_eight")
+    return WalkSettings(motion=replace(_motion(rng), shape="figure_eight"))
 
 
 def _slow(rng: Generator) -> WalkSettings:
-    """Half a metre in two seconds."""
-    return _paced(_swing(rng), 0.25)
+    """A quarter of a metre per second."""
+    return WalkSettings(motion=_paced(_motion(rng), 0.25))
 
 
 def _brisk(rng: Generator) -> WalkSettings:
     """1 m/s, the pace of a practised user; the rig's step length is still the nominal one."""
-    return _paced(_swing(rng), 1.0)
+    return WalkSettings(motion=_paced(_motion(rng), 1.0))
 
 
 def _step_back(rng: Generator) -> WalkSettings:
     """Midway the walker stops, steps back by half a metre to a metre, stands, and goes on."""
-    settings = _swing(rng)
-    at = course_of(settings.motion).length * rng.uniform(0.3, 0.7)
-    return _moved(settings, pauses=(Pause(at=at, duration=2.0, back=rng.uniform(0.5, 1.0)),))
+    motion = _motion(rng)
+    at = course_of(motion).length * rng.uniform(0.3, 0.7)
+    back = Pause(at=at, duration=2.0, back=rng.uniform(0.5, 1.0))
+    return WalkSettings(motion=replace(motion, pauses=(back,)))
 
 
 SCENARIOS: Mapping[str, Callable[[Generator], WalkSettings]] = MappingProxyType(
@@ -234,15 +226,20 @@ SCENARIOS: Mapping[str, Callable[[Generator], WalkSettings]] = MappingProxyType(
 )
 
 
-def _moved(settings: WalkSettings, **changes: object) -> WalkSettings:
-    return replace(settings, motion=replace(settings.motion, **changes))
+def _motion(rng: Generator) -> MotionSettings:
+    """The paper's walk, either way round."""
+    return MotionSettings(clockwise=_coin(rng))
 
 
-def _paced(settings: WalkSettings, speed: float) -> WalkSettings:
-    """Another speed, with the step length that goes with it (square root, as in walk.py)."""
-    step = settings.motion.step_length * np.sqrt(speed / settings.motion.speed)
-    return _moved(settings, speed=speed, step_length=float(step))
+def _paced(motion: MotionSettings, speed: float) -> MotionSettings:
+    """Another speed (m/s), with the step length that goes with it: square root, as in walk.py."""
+    return replace(motion, speed=speed, step_length=motion.step_length * math.sqrt(speed / motion.speed))
 
 
 def _coin(rng: Generator) -> bool:
     return bool(rng.random() < 0.5)
+
+
+def _spread(rng: Generator, low: float, high: float) -> float:
+    """A number between two, evenly spread over orders of magnitude."""
+    return float(low * (high / low) ** rng.random())

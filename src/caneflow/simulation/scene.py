@@ -117,7 +117,7 @@ def _walls(low: Floats, high: Floats, rng: Generator) -> list[tuple[Floats, Comp
 
 
 def _walker(course: Course, rng: Generator) -> Walker:
-    """A trunk of eight scatterers and two legs of four, the legs in opposite phase; a third of the power is legs."""
+    """A trunk of eight scatterers and two legs of four in opposite phase; a third of the power is legs."""
     trunk = np.stack([rng.uniform(-0.2, 0.2, 8), rng.uniform(0.9, 1.6, 8)], axis=1)
     height = np.linspace(0.1, 0.8, 4)
     legs = [np.stack([np.full(4, side), height], axis=1) for side in (-0.1, 0.1)]

@@ -14,7 +14,7 @@ from numpy.random import Generator
 from scipy.interpolate import CubicSpline
 
 from caneflow.simulation import attitude
-from caneflow.simulation.attitude import Floats
+from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.course import Course, Shape, course
 from caneflow.simulation.wander import slow, tremulous
 
@@ -26,10 +26,10 @@ NotNegative = Annotated[float, Ge(0)]
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """What is bolted on, as `rig:` in the yaml and in a recording (wire.md). The boresight is the body's y axis."""
+    """What is bolted on, as `rig:` in the yaml and a recording (wire.md). The boresight is the body's y axis."""
 
     hand_height: Positive = 0.95  # m, nominal (wire.md, design.md)
-    aperture: Positive = np.deg2rad(50.0)  # rad, full -3 dB angle, one way (design.md: 0.87)
+    aperture: Positive = 50.0 * DEGREE  # rad, full -3 dB angle, one way (design.md: 0.87)
     pivot: tuple[float, float, float] = (0.0, -0.3, 0.0)  # m, sensors to hand, body (cane.md: 0.3 m)
     antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, IMU to antenna, body
     step_length: Positive = 0.42  # m, nominal (design.md); for step counting only
@@ -84,13 +84,13 @@ class MotionSettings:
     # The hand and the cane
     hand_ahead: float = 0.35  # m in front of the body, chosen: forearm forward
     hand_height_error: NotNegative = 0.01  # m, sd of the person's hand about the rig's nominal height, chosen
-    swing: NotNegative = np.deg2rad(20.0)  # rad, amplitude (cane.md: about +-20 deg)
+    swing: NotNegative = 20.0 * DEGREE  # rad, amplitude (cane.md: about +-20 deg)
     swing_variation: NotNegative = 0.08  # of the swing, sd, chosen
     swing_until: float | None = None  # fraction of the course after which the cane is held still
-    pitch: Positive = np.deg2rad(42.0)  # rad (cane.md: about 42 deg)
-    pitch_spread: NotNegative = np.deg2rad(2.0)  # rad, sd between walks, chosen
+    pitch: Positive = 42.0 * DEGREE  # rad (cane.md: about 42 deg)
+    pitch_spread: NotNegative = 2.0 * DEGREE  # rad, sd between walks, chosen
     tip_lift: NotNegative = 0.03  # m, the tip clears the ground in the middle of its arc, chosen
-    wander: NotNegative = np.deg2rad(1.5)  # rad, sd of each angle over some steps while walking, chosen
+    wander: NotNegative = 1.5 * DEGREE  # rad, sd of each angle over some steps while walking, chosen
 
     # A hand-held rest is not still: about 0.4 deg of drift (cane.md), which is what a wander of 0.4 deg with a
     # correlation of 2 s does in 2 s; the hand by 3 mm (chosen). `restlessness` scales both.
@@ -132,8 +132,8 @@ class _Leg(NamedTuple):
 _RAMP = 1.0  # s from standing to cruising: about two steps, chosen
 _BACKWARD_PACE = 0.5  # of the forward one, chosen
 _PACE_SCALE = 3.0  # m over which speed and step length wander, chosen
-_WANDER_SCALE = 6.0  # steps over which the cane's angles wander, chosen
-_DRIFT = (np.deg2rad(0.4), 0.003)  # rad and m (see MotionSettings.restlessness)
+_WANDER_SCALE = 3.0  # steps over which the cane's angles wander, chosen
+_DRIFT = (0.4 * DEGREE, 0.003)  # rad and m (see MotionSettings.restlessness)
 _DRIFT_SCALE = 2.0  # s
 _TREMOR = (7.0, 1.0)  # Hz, centre and width (see MotionSettings.tremor)
 
@@ -306,8 +306,8 @@ def _orientation(
 ) -> Floats:
     """Orientation of the cane, (n, 4).
 
-    Two-point touch: at each heel strike the tip touches the ground on one side, in between it passes the middle and
-    is lifted. While the cane swings no more it is held straight ahead.
+    Two-point touch: at each heel strike the tip touches the ground on one side, in between it passes the middle
+    and is lifted. When the cane swings no more it is held straight ahead.
     """
     side = rng.choice([-1.0, 1.0])
     held = _eased(0.5 * (steps - swing_ends))  # 0 while swinging, 1 two steps after the last one

@@ -24,10 +24,11 @@ class Wander:
 
     def __call__(self, argument: Floats) -> Floats:
         """Values at `argument`, shape (n,) to (n,)."""
-        total = np.zeros_like(argument)
+        total: Floats = np.zeros_like(argument)
         for frequency, phase in zip(self.frequencies, self.phases, strict=True):
             total += np.cos(frequency * argument + phase)
-        return self.deviation * np.sqrt(2.0 / TERMS) * total
+        total *= self.deviation * np.sqrt(2.0 / TERMS)
+        return total
 
 
 def slow(rng: Generator, deviation: float, scale: float) -> Wander:

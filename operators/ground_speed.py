@@ -1,0 +1,88 @@
+"""Speed over ground from radar frames, the cane's attitude telling where the beam meets the ground.
+
+in   frame : RadarFrame   one scan per 10 ms
+in   imu   : Imu          orientation and gyro
+out  speed : GroundSpeed  one per frame
+"""
+
+from dataclasses import dataclass, field
+
+from caneflow.algorithms.attitude_history import AttitudeHistory
+from caneflow.algorithms.footprint import CaneGeometry
+from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
+from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings
+from caneflow.messages import GroundSpeed, Imu, RadarFrame, Sample
+from caneflow.messages.rig import Rig
+from caneflow.runtime import Context, Emitted, Operator, Refused
+from caneflow.runtime.node import run
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundSpeedSettings:
+    """What is common to all front ends, and what each may be told."""
+
+    moving_returns: MovingReturnsSettings = field(default_factory=MovingReturnsSettings)
+    paper: PaperSpeedSettings = field(default_factory=PaperSpeedSettings)
+
+
+class GroundSpeedOperator(Operator):
+    """The paper's front end (eq. 1-4) on a sliding window."""
+
+    inputs = {"frame": RadarFrame, "imu": Imu}
+    outputs = {"speed": GroundSpeed}
+    Settings = GroundSpeedSettings
+
+    def __init__(self, settings: GroundSpeedSettings, context: Context) -> None:
+        self._moving_returns = MovingReturnsFilter(settings.moving_returns)
+        self._paper = PaperSpeed(settings.paper, geometry(context.rig))
+        self._attitudes = AttitudeHistory()
+
+    def handle(self, port: str, message: Sample) -> Emitted:
+        """Yield the speed at a frame's stamp; an IMU sample only tells the attitude."""
+        match message:
+            case Imu():
+                self._take_attitude(message)
+            case RadarFrame():
+                yield "speed", self._speed(message)
+
+    def _take_attitude(self, imu: Imu) -> None:
+        if imu.orientation is None:
+            raise Refused("the IMU sample has no orientation; put operators.attitude in front of ground_speed")
+        self._attitudes.add(imu.stamp, imu.orientation, imu.gyro)
+
+    def _speed(self, frame: RadarFrame) -> GroundSpeed:
+        parameters = RadarParameters(
+            scan_period=frame.scan_period,
+            range_start=frame.range_start,
+            range_step=frame.range_step,
+            carrier=frame.carrier,
+            bandwidth=frame.bandwidth,
+        )
+        try:
+            returns = self._moving_returns.update(frame.stamp, frame.scans, parameters)
+        except ValueError as error:
+            raise Refused(str(error)) from error
+        estimate = self._paper.update(returns, self._attitudes)
+        return GroundSpeed(
+            stamp=frame.stamp,
+            speed=estimate.speed,
+            quality=estimate.quality,
+            rays=estimate.rays,
+            valid=estimate.valid,
+            delay=estimate.delay,
+        )
+
+
+def geometry(rig: Rig) -> CaneGeometry:
+    """What the front ends need of the rig; raises MessageError for what is not known."""
+    return CaneGeometry(
+        hand_height=rig.need("hand_height"),
+        aperture=rig.need("aperture"),
+        pivot=rig.need("pivot"),
+        boresight=rig.boresight,
+        antenna=rig.antenna,
+    )
+
+
+if __name__ == "__main__":
+    run(GroundSpeedOperator)

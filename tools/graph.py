@@ -1,0 +1,44 @@
+"""`caneflow graph`: a picture of a flow."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from caneflow.runtime.dataflow import load
+from caneflow.runtime.graph import Graph
+from caneflow.runtime.graph_pictures import as_data, as_mermaid, as_svg
+
+DRAW: dict[str, Callable[[Graph], str]] = {
+    "mermaid": as_mermaid,
+    "svg": as_svg,
+    "json": lambda graph: json.dumps(as_data(graph), indent=2) + "\n",
+}
+
+
+def command(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="The dataflow, e.g. dataflow.yaml.", show_default=False)
+    ],
+    kind: Annotated[
+        Literal["mermaid", "svg", "json"],
+        typer.Option(
+            "--format", help="mermaid: text for Markdown pages; svg: drawn by Graphviz; json: nodes and edges."
+        ),
+    ] = "mermaid",
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="Write it there; by default it is printed."),
+    ] = None,
+) -> None:
+    """Draw a flow: its programs, the messages between them, the machines they are on.
+
+    Example: caneflow graph dataflow.yaml --format svg -o flow.svg
+    """
+    picture = DRAW[kind](load(file))
+    if output is None:
+        print(picture, end="")
+    else:
+        output.write_text(picture, encoding="utf-8")
