@@ -411,7 +411,7 @@ def test_settings_whose_own_check_breaks_are_one_line(folder: Path) -> None:
     (line,) = mistakes(folder, FLOW, "fuse.observer.pole=0.25")
 
     assert line.startswith(
-        "--set fuse.observer.pole=0.25: nodes.fuse.settings: Settings_ breaks on these: ZeroDivisionError: division"
+        "--set fuse.observer.pole=0.25: nodes.fuse.settings: Settings_ breaks on these: ZeroDivisionError: "
     )
 
 
@@ -461,7 +461,7 @@ wirings = st.integers(1, 6).flatmap(
 
 
 @given(wirings)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_cycles_are_reported_exactly_when_a_node_reaches_itself(
     tmp_path_factory: pytest.TempPathFactory, reads: dict[str, list[str]]
 ) -> None:
@@ -537,7 +537,7 @@ def flow_style(value: Any) -> str:
 
 
 @given(st.data(), st.sampled_from(sorted(LEVELS)))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_stray_key_is_found_where_it_was_written(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, level: str
 ) -> None:

@@ -1,9 +1,9 @@
-"""The analytic signal of radar scans along fast time: real samples in, complex ones out, limited to the pulse's band.
+"""The analytic signal of radar scans along fast time: real samples in, complex ones out, within the pulse's band.
 
-A real scan holds every echo twice, at plus and minus the carrier, and so cannot tell approaching from receding. Its
-analytic signal keeps the positive half of the spectrum, doubled; what lies outside the pulse's band is only noise
-(cane.md row 2). The phase of an echo at range R is then -4 pi R carrier / c: it grows while the range shrinks, and
-positive Doppler means approaching.
+A real scan holds every echo twice, at plus and minus the carrier, and so cannot tell approaching from receding.
+Its analytic signal keeps the positive half of the spectrum, doubled; what lies outside the pulse's band is only
+noise (cane.md row 2). An echo at range R then has the phase -4 pi R carrier / c: it grows while the range shrinks,
+so positive Doppler means approaching.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ def fast_time_frequencies(bins: int, range_step: float) -> NDArray[np.float64]:
 
     `range_step` is the spacing of the samples in metres of range.
     """
-    return np.arange(bins // 2 + 1) * (SPEED_OF_LIGHT / (2 * range_step * bins))
+    return np.arange(bins // 2 + 1, dtype=np.float64) * (SPEED_OF_LIGHT / (2 * range_step * bins))
 
 
 class AnalyticSignal:
@@ -42,7 +42,6 @@ class AnalyticSignal:
 
     def __call__(self, scans: NDArray[np.number]) -> NDArray[np.complex64]:
         """The analytic signals of real `scans`, shape (..., bins); same shape."""
-        one_sided = rfft(scans.astype(np.float32), axis=-1)
+        one_sided = rfft(scans.astype(np.float32))
         one_sided *= self._gain
-        signals: NDArray[np.complex64] = ifft(one_sided, self._bins, axis=-1, overwrite_x=True)
-        return signals
+        return ifft(one_sided, self._bins, overwrite_x=True).astype(np.complex64, copy=False)

@@ -1,7 +1,7 @@
 """What stands still in the radar's own frame, and its removal: direct coupling, the cane's tip, walls at rest.
 
-A running mean over the recent past, weighted exp(-age / time constant) (cane.md row 3). The age is elapsed time, so
-the mean is the same at any scan rate and forgets by itself across a gap.
+A running mean over the recent past, weighted exp(-age / time constant) (cane.md row 3). The age is elapsed time,
+so the mean is the same at any scan rate and forgets by itself across a gap.
 """
 
 import math
@@ -22,8 +22,8 @@ class Background:
     def remove(self, scan: NDArray[np.complex64], elapsed: float) -> None:
         """Take the mean of the past and itself off `scan`, shape (M,), in place; nothing is left of the first one.
 
-        `elapsed` is the time (s) since the scan before. Counting every scan with weight 1 when it arrives makes the
-        mean right from the first scan on: no start value has to fade out.
+        `elapsed` is the time (s) since the scan before. As every scan arrives with weight 1, the mean is right
+        from the first scan on: no start value has to fade out.
         """
         if self._mean is None:
             self._mean = np.zeros_like(scan)

@@ -21,7 +21,7 @@ def superior_edges(
 
     Returns:
         Fractional column indices, shape (K,): the vertex of the parabola through the greatest difference between
-        neighbours and the two beside it. And those differences, shape (K,). A flat row gives some index and 0:
+        neighbours and the two beside it; and those differences, shape (K,). A flat row gives some index, and 0:
         whether there is anything to see is not decided here.
     """
     falls = magnitudes[:, :-1] - magnitudes[:, 1:]
@@ -29,7 +29,7 @@ def superior_edges(
     steepest = falls[:, 1:-1].argmax(axis=1) + 1  # with a neighbour on either side
     flat = steepest + np.arange(0, falls.size, columns)
     before, top, after = falls.take(flat - 1), falls.take(flat), falls.take(flat + 1)
-    # The guard keeps a flat row from dividing by 0; the clip holds where a neighbour at the rim falls still steeper.
+    # FLAT keeps a flat row from dividing by 0; the clip holds where a neighbour at the rim falls still steeper.
     curvature = np.minimum(before - 2 * top + after, -FLAT)
     shift = np.minimum(np.maximum(0.5 * (before - after) / curvature, -0.5), 0.5)
     # The difference between columns i and i + 1 belongs half way between them.

@@ -55,8 +55,8 @@ NO_RAYS = Rays(rows=np.empty(0, dtype=np.intp), cosines=np.empty(0))
 class RayCaster:
     """Rays of one fan, for scans of one shape.
 
-    Rays are spread evenly in range, not in angle: every cell of range resolution then is looked at equally often, and
-    the estimate varies less by a fifth. One row more on either side lets every ray be averaged with two neighbours.
+    Rays are spread evenly in range, not in angle: every cell of range resolution is then looked at equally often,
+    and the estimate varies less by a fifth. One row more at either end gives every ray two neighbours.
     """
 
     def __init__(self, fan: Fan, *, bins: int, range_start: float, range_step: float) -> None:
@@ -81,7 +81,7 @@ class RayCaster:
             return NO_RAYS
         scaled = self._shares * ((last - first) / self._step) + ((first - self._start) / self._step + 0.5)
         rows = scaled.astype(np.intp)
-        # A ray's angle is that of its bin's centre: rounding to bins would cost up to 2 % of speed at steep angles.
+        # A ray's angle is that of its bin's centre: rounding would cost up to 2 % of speed at steep angles.
         sines = height / (self._start + rows[1:-1] * self._step)
         cosines = np.sqrt(1.0 - np.minimum(sines, math.sin(fan.steepest)) ** 2)
         return Rays(rows=rows, cosines=cosines)

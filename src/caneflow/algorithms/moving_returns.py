@@ -1,7 +1,7 @@
 """Radar frames, as they come, into what moves: analytic scans without their background, in even steps of time.
 
-Shared by all estimators of speed, so that none works it out twice. Lost scans leave zeros, the neutral value after the
-background is gone; a longer gap, or a frame of another make, starts anew and says so.
+Shared by all estimators of speed, so that none works it out twice. Lost scans leave zeros, the neutral value once
+the background is gone; a longer gap, or a frame of another make, starts anew and says so.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.analytic_signal import AnalyticSignal
 from caneflow.algorithms.background import Background
+
+LARGEST_SAMPLE = 1e12  # the square of its spectrum still fits a float32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,12 +61,15 @@ class MovingReturnsFilter:
         """The moving part of a frame's `scans`, shape (N, M), real or complex; `stamp_ns` is its last scan's.
 
         Raises:
-            ValueError: no scan at all, a stamp that is not newer than the frame's before, or a pulse that the range
-                bins cannot hold.
+            ValueError: no scan at all, samples that are no numbers or absurdly large, a stamp that is not newer
+                than the frame's before, or a pulse that the range bins cannot hold.
         """
         count, bins = scans.shape
         if count == 0 or bins == 0:
             raise ValueError(f"a frame of {count} scans of {bins} bins holds nothing")
+        if scans.dtype.kind in "fc" and not np.abs(scans).max() <= LARGEST_SAMPLE:
+            # One NaN would stay in the running mean for ever; a huge value would become one.
+            raise ValueError(f"frame at {stamp_ns} ns has samples that are not finite or above {LARGEST_SAMPLE:g}")
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"frame at {stamp_ns} ns is not newer than the last, {self._last_ns} ns")
         make = (parameters, bins, scans.dtype.kind == "c")

@@ -1,6 +1,6 @@
-"""The paper's speed over ground: superior edges of the Doppler spectra along rays of the beam (section IV, eq. 1-4).
+"""The paper's speed over ground: superior edges of Doppler spectra along the rays of the beam (paper IV, eq. 1-4).
 
-One estimate per frame, over the newest `window` scans; it belongs to the window's middle. Rows cited are cane.md's.
+One estimate per frame, over the newest `window` scans; it belongs to the window's middle. Rows are cane.md's.
 """
 
 import math
@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from operator import mul
 from statistics import median
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
@@ -23,6 +23,8 @@ from caneflow.algorithms.range_doppler import SlowTimeWindow, hann, speed_per_bi
 from caneflow.algorithms.rest import RestSettings, is_at_rest, peak_and_floor
 from caneflow.algorithms.rotations import Quaternion
 
+Average: TypeAlias = Literal["mean", "median", "weighted"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class PaperSpeedSettings:
@@ -31,21 +33,16 @@ class PaperSpeedSettings:
     window: Annotated[int, Ge(8)] = 64  # scans, N (row 4)
     transform: Annotated[int, Ge(16)] = 256  # Doppler bins, zero-padded from the window
     rays: Annotated[int, Ge(2)] = 16  # K (row 5)
-    rows_per_ray: Annotated[int, Ge(1)] = (
-        3  # spectra averaged over one cell of range resolution; 1: as in the paper
-    )
-    aperture_share: Annotated[float, Gt(0), Le(1)] = 0.8  # of the rig's aperture that the rays span
+    aperture_share: Annotated[float, Gt(0), Le(1)] = 0.8  # of the rig's aperture, that the rays span
     shallowest: Annotated[float, Gt(0)] = math.radians(18)  # rad, of a ray to the ground
     steepest: Annotated[float, Lt(math.pi / 2)] = math.radians(80)  # rad
     compensate_edge: bool = True  # take off what the edge lies beyond the speed (row 6)
     edge_beyond_speed: Annotated[float, Ge(0)] = EDGE_BEYOND_SPEED  # resolution cells of the window
-    average: Literal["mean", "median", "weighted"] = (
-        "mean"  # f and g of eq. 3, 4 (row 7); weights: the fall's height
-    )
+    average: Average = "mean"  # f and g of eq. 3, 4 (row 7); weighted: by the height of a ray's fall
     agreement: Annotated[float, Gt(0)] = 0.25  # m/s, from the rays' median, within which a ray agrees
-    fewest_rays: Annotated[int, Ge(1)] = 6  # that must agree
-    least_peak: Annotated[float, Gt(0)] = 4.0  # of a ray's Doppler power to the noise floor
-    alias_share: Annotated[float, Gt(0), Le(1)] = 0.9  # of the unambiguous radial speed up to which an edge counts
+    fewest_rays: Annotated[int, Ge(1)] = 8  # that must agree
+    least_peak: Annotated[float, Gt(0)] = 6.0  # of a ray's Doppler power, in noise floors
+    alias_share: Annotated[float, Gt(0), Le(1)] = 0.9  # of the radial speed limit, up to which an edge counts
     most_lost: Annotated[float, Ge(0), Lt(1)] = 0.25  # share of a window's scans that may be missing
     rest: RestSettings = field(default_factory=RestSettings)
 
@@ -56,7 +53,7 @@ class SpeedEstimate:
 
     speed: float  # m/s, eq. 3; 0 when not valid
     quality: float  # m/s, eq. 4, spread over the rays: smaller is better; inf when not valid
-    rays: int  # that agree and were averaged
+    rays: int  # that showed an edge and were averaged
     valid: bool
     delay: float  # s from the window's middle, where the estimate belongs, to the newest scan
 
@@ -91,14 +88,13 @@ class PaperSpeed:
     def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> SpeedEstimate:
         """The estimate after one more frame.
 
-        Not valid while the window is not full or too much of it was lost, without an attitude for its middle, where
-        too few rays meet the ground or agree, and where the speed comes near the limit of unambiguous Doppler.
+        Not valid while the window is not full or too much of it was lost, without an attitude for its middle,
+        where too few rays meet the ground or agree, where the ground recedes, and near the limit of Doppler.
         """
         self._push(returns)
-        settings, period = self._settings, returns.parameters.scan_period
-        delay = (settings.window - 1) / 2 * period
+        settings = self._settings
         if len(self._stamps_ns) < settings.window:
-            return _nothing(delay)
+            return _nothing((settings.window - 1) / 2 * returns.parameters.scan_period)
         oldest_ns, newest_ns = self._stamps_ns[0], self._stamps_ns[-1]
         delay = (newest_ns - oldest_ns) * 0.5e-9
         orientation = attitudes.at((oldest_ns + newest_ns) // 2)
@@ -115,14 +111,14 @@ class PaperSpeed:
             return SpeedEstimate(speed=0.0, quality=0.0, rays=settings.rays, valid=True, delay=delay)
         half = settings.transform // 2
         if spectrum[half:].sum() > spectrum[:half].sum():
-            return _nothing(delay)  # the ground recedes, or approaches so fast that its Doppler has come round
+            return _nothing(delay)  # receding ground, or so fast that its Doppler comes round from the other side
         per_bin = speed_per_bin(
-            scan_period=delay * 2 / (settings.window - 1),  # measured, not nominal
+            scan_period=2 * delay / (settings.window - 1),  # measured, not nominal
             carrier=returns.parameters.carrier,
             transform=settings.transform,
         )
-        speeds, weights = self._ray_speeds(power, floor / settings.rays, per_bin / rays.cosines)
-        return self._average(speeds, weights, delay)
+        speeds, falls = self._ray_speeds(power, floor / settings.rays, per_bin / rays.cosines)
+        return self._average(speeds, falls, delay)
 
     def _push(self, returns: MovingReturns) -> None:
         if returns.restarted:
@@ -148,13 +144,11 @@ class PaperSpeed:
     def _power(self, rays: Rays) -> NDArray[np.float32]:
         """Doppler power along each ray, in sum with its neighbours'; shape (K, transform), FFT order.
 
-        One range bin's spectrum is speckle: its steepest fall is as often that of a chance gap in the ground as that
-        of the fastest piece of it. Three bins, a range cell apart, bring out the edge where theory has it.
+        One range bin's spectrum is speckle, its steepest fall often that of a chance gap below the fastest ground.
+        In sum over three bins, most of a range cell apart, the edge lies where the expected spectrum has it.
         """
-        np.multiply(
-            self._window.view()[rays.rows], self._weights, out=self._padded[:, : self._settings.window]
-        )
-        power = np.abs(fft(self._padded, axis=-1))
+        np.multiply(self._window.view()[rays.rows], self._weights, out=self._padded[:, : self._settings.window])
+        power: NDArray[np.float32] = np.abs(fft(self._padded))
         power *= power
         summed = power[:-2] + power[1:-1]
         summed += power[2:]
@@ -165,8 +159,8 @@ class PaperSpeed:
     ) -> tuple[list[float], list[float]]:
         """Speed over ground (m/s, eq. 2) of the rays that show one, and the heights of their edges.
 
-        A ray shows one if its Doppler stands out of the noise `floor`, and if its edge lies well below the limit of
-        unambiguous Doppler.
+        A ray shows one if its Doppler stands out of the noise `floor`, and if its edge lies well below the limit
+        of unambiguous Doppler.
         """
         settings = self._settings
         half = settings.transform // 2
@@ -177,26 +171,22 @@ class PaperSpeed:
         if settings.compensate_edge:
             cell = settings.transform / settings.window  # Doppler bins
             edges = np.maximum(edges - settings.edge_beyond_speed * cell, 0.0)
-        return (edges * per_bin)[shows].tolist(), falls[shows].tolist()
+        speeds: list[float] = (edges * per_bin)[shows].tolist()
+        heights: list[float] = falls[shows].tolist()
+        return speeds, heights
 
-    def _average(self, speeds: list[float], weights: list[float], delay: float) -> SpeedEstimate:
-        """Eq. 3 and 4 over the rays that agree. Plain Python: for a handful of numbers numpy's calls cost more."""
+    def _average(self, speeds: list[float], falls: list[float], delay: float) -> SpeedEstimate:
+        """Eq. 3 and 4. In plain Python: for a handful of numbers, numpy's calls cost more."""
         settings = self._settings
         if len(speeds) < settings.fewest_rays:
             return _nothing(delay)
-        centre = median(speeds)
-        if settings.average == "weighted":
-            pairs = [(s, w) for s, w in zip(speeds, weights, strict=True) if abs(s - centre) <= settings.agreement]
-            speeds, weights = [s for s, _ in pairs], [w for _, w in pairs]
-        else:
-            speeds = [s for s in speeds if abs(s - centre) <= settings.agreement]
-            weights = [1.0] * len(speeds)
-        if len(speeds) < settings.fewest_rays:
+        middle = median(speeds)
+        if sum([abs(speed - middle) <= settings.agreement for speed in speeds]) < settings.fewest_rays:
             return _nothing(delay)
+        weights = falls if settings.average == "weighted" else [1.0] * len(speeds)
         total = sum(weights)
-        if settings.average != "median":
-            centre = sum(map(mul, speeds, weights)) / total
-        spread = math.sqrt(sum([w * (s - centre) ** 2 for s, w in zip(speeds, weights, strict=True)]) / total)
+        centre = middle if settings.average == "median" else sum(map(mul, weights, speeds)) / total
+        spread = math.sqrt(sum([w * (s - centre) ** 2 for w, s in zip(weights, speeds, strict=True)]) / total)
         return SpeedEstimate(speed=centre, quality=spread, rays=len(speeds), valid=True, delay=delay)
 
 

@@ -1,7 +1,7 @@
 """From scans to the range-Doppler map, and from its indices to metres and metres per second (paper IV.A, eq. 1).
 
-Slow time runs over scans, fast time over range bins. Doppler bins are in FFT order: 0, positive (approaching) up to
-half the transform, then negative.
+Slow time runs over scans, fast time over range bins. Doppler bins are in FFT order: 0, positive (approaching) up
+to half the transform, then negative.
 """
 
 import math
@@ -44,9 +44,9 @@ def speed_limit(*, scan_period: float, carrier: float) -> float:
 
 
 def hann(length: int) -> NDArray[np.float32]:
-    """The Hann window of `length` scans, shape (length,), symmetric about the middle of the first and last.
+    """The Hann window of `length` scans, shape (length,), symmetric about the middle between first and last.
 
-    Sampled between the points of the usual form, so that no weight is 0 and its spectrum is that of the periodic one.
+    Sampled half way between the usual points: no weight is 0, and its spectrum is that of the periodic form.
     """
     phase = 2 * math.pi * (np.arange(length) + 0.5) / length
     return (0.5 - 0.5 * np.cos(phase)).astype(np.float32)

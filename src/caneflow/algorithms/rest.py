@@ -4,9 +4,9 @@ At rest an edge detector finds an edge in noise, and a metre of walk per stop. B
 rest before them: the gyro's lies far above its bias, and the radar's is relative to a noise floor that is read off
 the very spectrum it judges.
 
-The radar's measure is the highest peak of the window's Doppler spectrum, away from zero. The energy of scan-to-scan
-differences would be the simpler one, but spreads noise from the whole Doppler axis over the few cells that ground
-fills: at 5 dB walking then differs from rest by a factor of 1.0 to 2.0, here by 4 to 50.
+The radar's measure is the highest peak of the window's Doppler spectrum, away from zero. The energy of
+scan-to-scan differences would be simpler, but buries the few cells that ground fills under the noise of the whole
+Doppler axis: at 5 dB, walking then differs from rest by a factor of 1.0 to 2.0, here by 4 to 50.
 """
 
 import math
@@ -39,8 +39,8 @@ def peak_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, flo
         power: shape (L,), slow-time power spectrum of a window of scans, in sum over ranges, in FFT order.
         cell: the window's resolution cell in Doppler bins.
 
-    The floor is the spectrum's lower quartile: moving ground fills Doppler on one side of zero only, so that at least
-    a quarter of the axis holds noise alone. It lies a little below the mean noise power.
+    The floor is the spectrum's lower quartile, a little below the mean noise power: moving ground fills Doppler on
+    one side of zero only, so that at least a quarter of the axis holds noise alone.
     """
     standing = math.ceil(STANDING_CELLS * cell)
     floor = np.sort(power)[len(power) // 4]

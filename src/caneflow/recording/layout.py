@@ -134,11 +134,11 @@ def walked(file: BinaryIO) -> Layout:
             continue
         elif opcode == Opcode.DATA_END:
             in_summary = True
-        elif opcode == Opcode.CHUNK:
-            in_chunks = True
+        elif opcode == Opcode.CHUNK or (opcode == MESSAGE and not in_chunks):
+            in_chunks = opcode == Opcode.CHUNK
             _add_block(layout, offset, raw)
-        elif opcode == MESSAGE and not in_chunks:
-            _add_block(layout, offset, raw)
+        elif opcode == MESSAGE:  # outside the chunks of a file that has chunks: something else, damaged
+            layout.damaged.append(offset)
         else:
             _add_other(layout, opcode, offset, raw)
     return layout
@@ -171,8 +171,6 @@ def _stretches(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
 
 def _add_other(layout: Layout, opcode: int, offset: int, raw: bytes) -> None:
     try:
-        if opcode == MESSAGE:
-            raise ValueError("a message outside the chunks of a file that has chunks: something else, damaged")
         _note(layout, opcode, raw[RECORD.size :])
     except DAMAGE:
         layout.damaged.append(offset)

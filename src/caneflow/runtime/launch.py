@@ -109,9 +109,9 @@ class Launcher:
                 for name, plan in deployment.plans.items()
             }
             with (
-                RunDirectory(deployment.flow, endpoint) as self._directory,
                 open_session(listen=[endpoint], replay=deployment.replay) as self._session,
-                Processes(self._events) as self._processes,
+                RunDirectory(deployment.flow, endpoint) as self._directory,  # tools may attach from here on
+                Processes(self._events, self._directory.path) as self._processes,
                 self._signals(),
             ):
                 self._subscribe()

@@ -43,7 +43,8 @@ def open_session(
         return zenoh.open(config)
     except zenoh.ZError as error:
         where = ", ".join((*listen, *connect))
-        raise DataflowError(f"no Zenoh session on {where}: {error}") from error
+        cause = str(error).partition(" at /")[0].strip()  # Zenoh adds the place in its own source
+        raise DataflowError(f"no Zenoh session on {where}: {cause}") from error
 
 
 class Ports:

@@ -36,11 +36,14 @@ class Exited(NamedTuple):
 class Processes:
     """Starts, watches and ends one process per node; a context manager that leaves none behind."""
 
-    def __init__(self, events: "queue.SimpleQueue[object]") -> None:
+    def __init__(self, events: "queue.SimpleQueue[object]", folder: Path) -> None:
+        """`folder` is the run's own: every node is started with a path in it, by which the guard finds them."""
         self._events = events
         self._running: dict[str, subprocess.Popen[str]] = {}
         self._guard = subprocess.Popen(
-            [sys.executable, "-I", "-S", guard.__file__], stdin=subprocess.PIPE, text=True, start_new_session=True
+            [sys.executable, "-I", "-S", guard.__file__, str(folder)],
+            stdin=subprocess.PIPE,
+            start_new_session=True,
         )
 
     def __enter__(self) -> "Processes":
@@ -48,9 +51,8 @@ class Processes:
 
     def __exit__(self, *_: object) -> None:
         self.end(list(self._running), patience=1.0)
-        assert self._guard.stdin is not None
-        self._guard.stdin.close()
-        self._guard.wait()
+        self._guard.kill()  # everything has ended: there is nothing left to guard
+        self._guard.communicate()
 
     def start(self, node: str, program: Sequence[str], plan: Path) -> int:
         """Start the node's process; its pid."""
@@ -64,7 +66,6 @@ class Processes:
             start_new_session=True,
             env={**ONE_THREAD, **os.environ, "PYTHONUNBUFFERED": "1"},
         )
-        self._tell_guard(f"+{process.pid}")
         self._running[node] = process
         threading.Thread(target=self._watch, args=(node, process), daemon=True, name=f"watch {node}").start()
         return process.pid
@@ -75,7 +76,6 @@ class Processes:
         if process is not None and process.pid == exited.pid:
             del self._running[exited.node]
             _signal_group(exited.pid, signal.SIGKILL)
-            self._tell_guard(f"-{exited.pid}")
 
     def kill(self, node: str) -> None:
         """End a node's process at once."""
@@ -98,12 +98,6 @@ class Processes:
                 process.wait()
             self.forget(Exited(node, process.pid, process.returncode))
         return killed
-
-    def _tell_guard(self, line: str) -> None:
-        assert self._guard.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # somebody killed the guard; the flow itself is sound
-            self._guard.stdin.write(line + "\n")
-            self._guard.stdin.flush()
 
     def _watch(self, node: str, process: "subprocess.Popen[str]") -> None:
         assert process.stdout is not None

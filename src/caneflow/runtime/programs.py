@@ -9,6 +9,7 @@ import sys
 import traceback
 from collections.abc import Mapping
 from contextlib import redirect_stdout
+from functools import lru_cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -95,11 +96,15 @@ def validated_settings(program: Program, settings: Mapping[str, Any]) -> Any:
 
 def check_settings(program: Program, settings: Mapping[str, Any]) -> tuple[Any, list[Mistake]]:
     """`settings` as the program's Settings, or None and what is wrong with them."""
-    checked: Checked[Any] = Checked(program.Settings)
     try:
-        return checked(settings)
+        return _checked(program.Settings)(settings)
     except Exception as error:  # a check of its own that breaks: users' code may raise anything
         return None, [Mistake((), f"{program.Settings.__qualname__} breaks on these: {_cause(error)}")]
+
+
+@lru_cache(maxsize=64)
+def _checked(kind: type[Any]) -> Checked[Any]:
+    return Checked(kind)
 
 
 class _Fresh(SourceFileLoader):
@@ -118,7 +123,7 @@ def _file(run: str, base: Path) -> Path:
         there = sorted(f"{Path(run).parent / found.name}" for found in folder.glob("*.py"))[:FILES_NAMED]
     except (OSError, ValueError) as error:  # a name that no file can have
         raise DataflowError(f"no Python file {shown(run)}: {one_line(error)}") from error
-    raise DataflowError(f"no Python file {shown(str(file))};{did_you_mean(run, there)} there are {listed(there)}")
+    raise DataflowError(f"no Python file {str(file)!r};{did_you_mean(run, there)} there are {listed(there)}")
 
 
 def _room(room: str) -> ModuleType:
@@ -184,7 +189,7 @@ def _check_tables(run: str, program: Program) -> None:
             if not (inspect.isclass(kind) and issubclass(kind, Sample)):
                 raise DataflowError(f"{where}[{shown(port)}] is {shown(kind)}; it takes a class of messages")
     try:
-        Checked(program.Settings)
+        _checked(program.Settings)
     except Exception as error:  # pydantic has a dozen ways to say that it cannot check a type
         raise DataflowError(
             f"{shown(run)}: {program.__name__}.Settings cannot be checked: {one_line(error)}"

@@ -133,6 +133,7 @@ def _advice(flow: FlowShape, one: str, other: str) -> str:
     for listener, dialler in ((one, other), (other, one)):
         for endpoint in flow.machines[listener].listen:
             protocol, host, port = _parts(endpoint)
-            host = f"{listener}.local" if host in EVERYWHERE else host
-            return f"e.g. {dialler}: {{connect: [{protocol}/{host}:{port}]}}"
+            if not _is_loopback(host):
+                host = f"{listener}.local" if host in EVERYWHERE else host
+                return f"e.g. {dialler}: {{connect: [{protocol}/{host}:{port}]}}"
     return f"e.g. {one}: {{listen: [tcp/0.0.0.0:7447]}}, {other}: {{connect: [tcp/{one}.local:7447]}}"

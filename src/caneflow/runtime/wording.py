@@ -9,7 +9,7 @@ from typing import TypeAlias
 KeyPath: TypeAlias = tuple[str | int, ...]  # the way to a value: keys of mappings, numbers in lists
 
 LONGEST = 60  # characters of a value that are worth a look
-PLAIN_KEY = re.compile(r"[\w*-]+")
+PLAIN_KEY = re.compile(r"[\w*<-]+")
 
 
 def shown(value: object) -> str:

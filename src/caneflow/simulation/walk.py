@@ -67,8 +67,8 @@ class MotionSettings:
     laps: Annotated[int, Ge(1)] = 1
     clockwise: bool = False
 
-    # The walk. 22 m in about 50 s with corners and starts (section VI.C) is a cruise of 0.45 m/s
-    speed: Positive = 0.45  # m/s on the straight
+    # The walk. 22 m in about 50 s with corners and starts (section VI.C) is a cruise of 0.465 m/s
+    speed: Positive = 0.465  # m/s on the straight
     speed_variation: NotNegative = 0.05  # of the speed, sd, chosen
     corner_slowing: NotNegative = 0.125  # m: speed / (1 + slowing |curvature|), 0.8 in the corners, chosen
     step_length: Positive = 0.42  # m at `speed`; goes with the square root of the speed

@@ -1,0 +1,456 @@
+"""The real command with real processes over loopback Zenoh: start, replay, record, kill, interrupt, lose nothing."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import zenoh
+
+from caneflow.messages import Imu, RadarFrame, control_key, decode, numbered, sample_key
+from caneflow.messages.control import Counters
+from caneflow.recording import Recording, RecordingWriter
+from caneflow.runtime.links import open_session
+from caneflow.runtime.run_directory import running_flows
+
+ROOT = Path(__file__).parents[1]
+CANEFLOW = [sys.executable, "-m", "caneflow.command"]
+DEADLINE = 30.0  # s for anything that is waited for
+
+CANE = """
+flow: {flow}
+nodes:
+  imu: {{run: drivers.bno055}}
+  radar: {{run: drivers.p440}}
+  ground_speed: {{run: operators.ground_speed, inputs: {{frame: radar/frame, imu: imu/imu}}}}
+  fusion: {{run: operators.fusion, inputs: {{imu: imu/imu, speed: ground_speed/speed}}}}
+results: [fusion/pose]
+"""
+
+TICKER = '''
+"""A live source: an IMU that ticks at 100 Hz."""
+import time
+from caneflow.messages import Imu
+from caneflow.runtime import Source
+from caneflow.runtime.node import run
+
+class Ticker(Source):
+    outputs = {"imu": Imu}
+
+    def __init__(self, settings, context):
+        pass
+
+    def samples(self):
+        while True:
+            time.sleep(0.01)
+            yield "imu", Imu(stamp=time.time_ns(), gyro=(0.0, 0.0, 0.0))
+
+if __name__ == "__main__":
+    run(Ticker)
+'''
+
+ECHO = '''
+"""A live operator: hands each IMU sample on."""
+from caneflow.messages import Imu
+from caneflow.runtime import Operator
+from caneflow.runtime.node import run
+
+class Echo(Operator):
+    inputs = {"imu": Imu}
+    outputs = {"imu": Imu}
+
+    def __init__(self, settings, context):
+        pass
+
+    def handle(self, port, message):
+        yield "imu", Imu(stamp=message.stamp, gyro=message.gyro)
+
+if __name__ == "__main__":
+    run(Echo)
+'''
+
+LIVE = """
+flow: {flow}
+nodes:
+  ticker: {{run: ./ticker.py}}
+  echo: {{run: ./echo.py, inputs: {{imu: ticker/imu}}, restart: {{policy: on-failure, delay_s: 0.1}}}}
+results: [echo/imu]
+"""
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """4 s of IMU samples and radar frames of noise: the graph runs on it, whatever it makes of it."""
+    path = tmp_path_factory.mktemp("walk") / "walk.mcap"
+    rng = np.random.default_rng(3)
+    rig = {"boresight": [0, 1, 0], "hand_height": 0.95, "aperture": 0.87, "pivot": [0, -0.3, 0]}
+    with RecordingWriter(path, flow="elsewhere", source="simulated", rig=rig) as writer:
+        for seq in range(400):
+            stamp = 1_000_000_000 + seq * 10_000_000
+            gyro, accel = rng.normal(size=(2, 3)).tolist()
+            imu = Imu(stamp=stamp, gyro=gyro, linear_accel=accel, orientation=(0.94, -0.342, 0.0, 0.0))
+            frame = RadarFrame(
+                stamp=stamp,
+                scans=rng.integers(-999, 999, size=(1, 96), dtype=np.int32),
+                scan_period=0.01,
+                range_start=0.5,
+                range_step=0.009149,
+                carrier=4.3e9,
+                bandwidth=1.7e9,
+            )
+            for node, port, message in (("imu", "imu", imu), ("radar", "frame", frame)):
+                key = sample_key("elsewhere", node, port)
+                writer.write(key, type(message), numbered(message, seq), stamp=stamp, seq=seq, log_time=stamp)
+    return path
+
+
+@pytest.fixture
+def flow(tmp_path: Path) -> str:
+    """A flow's name that no other test uses."""
+    return "t" + re.sub(r"\W", "", tmp_path.name).lower()[-40:]
+
+
+@pytest.fixture
+def cane(tmp_path: Path, flow: str) -> Path:
+    path = tmp_path / "dataflow.yaml"
+    path.write_text(CANE.format(flow=flow))
+    return path
+
+
+@pytest.fixture
+def live(tmp_path: Path, flow: str) -> Path:
+    (tmp_path / "ticker.py").write_text(TICKER)
+    (tmp_path / "echo.py").write_text(ECHO)
+    path = tmp_path / "live.yaml"
+    path.write_text(LIVE.format(flow=flow))
+    return path
+
+
+def caneflow(*args: object) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run([*CANEFLOW, *map(str, args)], capture_output=True, text=True, timeout=90, check=False)
+
+
+class Running:
+    """A flow that was started and goes on."""
+
+    def __init__(self, flow: str, *args: object) -> None:
+        self.flow = flow
+        self.process = subprocess.Popen(
+            [*CANEFLOW, *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+
+    def end(self, number: int) -> tuple[int, str]:
+        """Send a signal; the exit status and everything that was printed."""
+        self.process.send_signal(number)
+        output, _ = self.process.communicate(timeout=DEADLINE)
+        return self.process.returncode, output
+
+    def nodes(self) -> list[psutil.Process]:
+        """The processes of the flow's nodes, the launcher and its guard left out."""
+        return processes_with(f"{self.flow}-{self.process.pid}/")
+
+    def node(self, name: str) -> psutil.Process:
+        return next(process for process in self.nodes() if process.cmdline()[-1].endswith(f"/{name}.json"))
+
+    def session(self) -> zenoh.Session:
+        """A client of the flow, as the tools are."""
+        wait_for(lambda: any(found.pid == self.process.pid for found in running_flows()), "the flow's address")
+        found = next(found for found in running_flows() if found.pid == self.process.pid)
+        return open_session(mode="client", connect=[found.endpoint])
+
+
+@pytest.fixture
+def start(flow: str) -> Iterator[Callable[..., Running]]:
+    started: list[Running] = []
+
+    def start(*args: object) -> Running:
+        started.append(Running(flow, *args))
+        return started[-1]
+
+    yield start
+    for running in started:
+        if running.process.poll() is None:
+            running.process.kill()
+        running.process.wait()
+        wait_for(lambda running=running: not running.nodes(), "the end of all nodes")  # type: ignore[misc]  # bound now
+        assert running.process.stdout is not None
+        running.process.stdout.close()
+
+
+def wait_for(condition: Callable[[], object], what: str, deadline: float = DEADLINE) -> None:
+    end = time.monotonic() + deadline
+    while not condition():
+        assert time.monotonic() < end, f"waited {deadline} s for {what}"
+        time.sleep(0.02)
+
+
+def processes_with(text: str) -> list[psutil.Process]:
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if text in " ".join(process.cmdline()) and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found
+
+
+def results(path: Path) -> dict[str, list[bytes]]:
+    """The payloads of what operators published, by node/port."""
+    with Recording(path) as recording:
+        out: dict[str, list[bytes]] = {}
+        for sample in recording.samples():
+            if sample.node in ("ground_speed", "fusion"):
+                out.setdefault(f"{sample.node}/{sample.port}", []).append(sample.payload)
+        return out
+
+
+def counters(session: zenoh.Session, flow: str, node: str) -> "Iterator[Counters]":
+    """The node's counters as it publishes them, once a second."""
+    with session.declare_subscriber(control_key(flow, "counters", node)) as subscriber:
+        end = time.monotonic() + DEADLINE
+        while time.monotonic() < end:
+            sample = subscriber.try_recv()
+            if sample is None:
+                time.sleep(0.02)
+            else:
+                yield decode(sample.payload.to_bytes(), Counters)
+
+
+def test_every_host_and_speed_gives_the_same_bytes(cane: Path, walk: Path, tmp_path: Path) -> None:
+    outputs = {}
+    for name, options in {
+        "max": ["--speed", "max"],
+        "paced": ["--speed", "2"],
+        "in_process": ["--in-process"],
+    }.items():
+        out = tmp_path / f"{name}.mcap"
+        done = caneflow("run", cane, "--replay", walk, *options, "--record", out)
+        assert done.returncode == 0, done.stderr
+        outputs[name] = results(out)
+    assert {stream: len(payloads) for stream, payloads in outputs["max"].items()} == {
+        "ground_speed/speed": 400,
+        "fusion/pose": 400,
+    }
+    assert outputs["paced"] == outputs["max"]
+    assert outputs["in_process"] == outputs["max"]
+
+
+def test_a_replay_keeps_the_recorded_spacing(cane: Path, walk: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    done = caneflow(
+        "run", cane, "--replay", walk, "--speed", "2", "--start", "1", "--duration", "2", "--record", out
+    )
+    assert done.returncode == 0, done.stderr
+    with Recording(out) as recording:
+        times = {
+            key: [s.log_time for s in recording.samples([key])] for key in (("imu", "imu"), ("fusion", "pose"))
+        }
+        first = next(recording.samples([("imu", "imu")]))
+    assert first.stamp == 2_000_000_000
+    assert first.seq == 0  # a run counts anew
+    for stream, log_times in times.items():
+        assert len(log_times) == 200, stream
+        assert (log_times[-1] - log_times[0]) / 1e9 == pytest.approx(1.99 / 2, abs=0.3)
+
+
+def test_a_loop_goes_on_with_stamps_and_numbers(
+    cane: Path, walk: Path, tmp_path: Path, start: Callable[..., Running]
+) -> None:
+    out = tmp_path / "out.mcap"
+    running = start("run", cane, "--replay", walk, "--speed", "20", "--loop", "--record", out)
+    with running.session() as session:
+        for counted in counters(session, running.flow, "fusion"):
+            if counted.outputs["pose"] > 900:
+                break
+    status, output = running.end(signal.SIGINT)
+    assert status == 130, output
+    with Recording(out) as recording:
+        assert recording.complete
+        poses = [(s.seq, s.stamp) for s in recording.samples([("fusion", "pose")])]
+    assert [seq for seq, _ in poses] == list(range(len(poses)))
+    spacing = {b - a for (_, a), (_, b) in zip(poses, poses[1:], strict=False)}
+    assert spacing == {10_000_000}, "the next turn begins one sample after the last"
+
+
+def test_ctrl_c_ends_everything_in_order(live: Path, tmp_path: Path, start: Callable[..., Running]) -> None:
+    out = tmp_path / "out.mcap"
+    running = start("run", live, "--record", out)
+    with running.session() as session:
+        next(counters(session, running.flow, "echo"))
+    nodes = running.nodes()
+    assert len(nodes) == 3
+    began = time.monotonic()
+    status, output = running.end(signal.SIGINT)
+    assert status == 130, output
+    assert time.monotonic() - began < 5
+    assert not any(node.is_running() for node in nodes)
+    with Recording(out) as recording:
+        assert recording.complete
+        counts = {stream: found.count for stream, found in recording.streams.items()}
+    assert counts["ticker", "imu"] >= counts["echo", "imu"] > 0
+
+
+@pytest.mark.parametrize("wait_for_ready", [True, False])
+def test_a_killed_launcher_leaves_no_process(
+    live: Path, start: Callable[..., Running], wait_for_ready: bool
+) -> None:
+    running = start("run", live)
+    if wait_for_ready:
+        with running.session() as session:
+            next(counters(session, running.flow, "echo"))
+    wait_for(lambda: len(running.nodes()) == 2, "two nodes")
+    running.process.kill()
+    running.process.wait()
+    wait_for(lambda: not running.nodes(), "the end of all nodes", deadline=5.0)
+
+
+def test_a_killed_node_comes_back_and_the_gap_is_counted(live: Path, start: Callable[..., Running]) -> None:
+    running = start("run", live)
+    with running.session() as session:
+        before = next(counters(session, running.flow, "echo"))
+        assert before.inputs["imu"].lost == 0, "the start barrier holds"
+        victim = running.node("echo")
+        victim.kill()
+        for counted in counters(session, running.flow, "echo"):
+            if counted.inputs["imu"].lost and counted.outputs["imu"] > 50:
+                break  # the new process hears and speaks; what it missed has a number
+    assert running.node("echo").pid != victim.pid
+    status, output = running.end(signal.SIGINT)
+    assert status == 130
+    assert "echo | ended with killed by SIGKILL; restart 1 of" in output
+
+
+def test_a_node_that_fails_for_good_ends_the_run(live: Path, tmp_path: Path) -> None:
+    (tmp_path / "echo.py").write_text(ECHO.replace("yield", "raise RuntimeError('no more') #"))
+    live.write_text(
+        live.read_text().replace(
+            "policy: on-failure, delay_s: 0.1", "policy: on-failure, max_restarts: 1, delay_s: 0.1"
+        )
+    )
+    done = caneflow("run", live)
+    assert done.returncode == 1
+    assert "RuntimeError: no more" in done.stderr
+    assert re.search(r"echo ended with status 1 after 1 restarts: .*RuntimeError: no more", done.stderr)
+
+
+def test_a_node_that_hangs_before_it_is_ready_is_named(
+    live: Path, tmp_path: Path, start: Callable[..., Running]
+) -> None:
+    (tmp_path / "echo.py").write_text(
+        ECHO.replace('if __name__ == "__main__":', 'if __name__ == "__main__":\n    import time; time.sleep(1000)')
+    )
+    live.write_text(
+        live.read_text().replace(
+            "restart: {policy: on-failure, delay_s: 0.1}", "restart: never, ready_timeout_s: 2"
+        )
+    )
+    done = caneflow("run", live)
+    assert done.returncode == 1
+    assert re.search(r"echo not ready after 2 s", done.stderr)
+    assert not processes_with(str(tmp_path / "echo.py"))
+
+
+def test_a_missing_program_is_found_before_anything_starts(live: Path, tmp_path: Path) -> None:
+    (tmp_path / "echo.py").unlink()
+    done = caneflow("run", live)
+    assert done.returncode == 2
+    assert re.search(r"live\.yaml:5:\d+: nodes\.echo\.run: no Python file '.*echo\.py'", done.stderr)
+    assert "Traceback" not in done.stderr
+
+
+def test_live_drivers_say_that_they_are_not_there_yet(cane: Path) -> None:
+    text = cane.read_text() + "rig: {hand_height: 0.95, aperture: 0.87, pivot: [0, -0.3, 0]}\n"
+    cane.write_text(text.replace("run: drivers.bno055", "run: drivers.bno055, restart: never"))
+    done = caneflow("run", cane)
+    assert done.returncode == 1
+    assert "--replay" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_recording_cut_short_is_replayed_up_to_the_cut(cane: Path, walk: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(walk.read_bytes()[: walk.stat().st_size * 2 // 3])
+    out = tmp_path / "out.mcap"
+    done = caneflow("run", cane, "--replay", cut, "--speed", "max", "--record", out)
+    assert done.returncode == 0, done.stderr
+    with Recording(cut) as given, Recording(out) as got:
+        frames = given.streams["radar", "frame"].count
+        assert 0 < frames < 400
+        assert got.streams["ground_speed", "speed"].count == frames
+
+
+def test_two_flows_side_by_side_do_not_hear_each_other(cane: Path, walk: Path, tmp_path: Path) -> None:
+    # The same file twice, so even the keys are the same.
+    both = [
+        subprocess.Popen(
+            [
+                *CANEFLOW,
+                "run",
+                str(cane),
+                "--replay",
+                str(walk),
+                "--speed",
+                "max",
+                "--record",
+                str(tmp_path / name),
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for name in ("a.mcap", "b.mcap")
+    ]
+    for process in both:
+        output, _ = process.communicate(timeout=90)
+        assert process.returncode == 0, output
+    a, b = results(tmp_path / "a.mcap"), results(tmp_path / "b.mcap")
+    assert a == b
+    assert len(a["fusion/pose"]) == 400
+
+
+def test_hostile_samples_are_refused_counted_and_named_once(live: Path, start: Callable[..., Running]) -> None:
+    running = start("run", live)
+    good = numbered(Imu(stamp=1, gyro=(0.0, 0.0, 0.0)), 0)
+    key = sample_key(running.flow, "ticker", "imu")
+    with running.session() as session:
+        next(counters(session, running.flow, "echo"))
+        for payload in (good[:-3], good + b"x", b"", b"\xc1", os.urandom(200), good, good):
+            session.put(key, payload)
+        session.put(key, good, encoding=zenoh.Encoding("application/msgpack").with_schema("caneflow.Pose/1"))
+        for counted in counters(session, running.flow, "echo"):
+            troubles = counted.inputs["imu"].refused + counted.inputs["imu"].repeated
+            if troubles >= 8:
+                break
+        before = counted.outputs["imu"]
+        for counted in counters(session, running.flow, "echo"):
+            if counted.outputs["imu"] > before + 20:
+                break  # the process lives on
+        assert counted.inputs["imu"].lost == 0
+    status, output = running.end(signal.SIGINT)
+    assert status == 130
+    assert output.count("a caneflow.Pose/1 came; the port takes caneflow.Imu/1") == 1
+    assert output.count("came again") == 1
+    assert "Traceback" not in output
+
+
+def test_an_unfit_recording_is_refused_in_one_line(cane: Path, walk: Path, tmp_path: Path) -> None:
+    text = cane.read_text()
+    cane.write_text(
+        text.replace("imu: {run: drivers.bno055}", "belt: {run: drivers.bno055}").replace("imu/imu", "belt/imu")
+    )
+    done = caneflow("run", cane, "--replay", walk)
+    assert done.returncode == 2
+    assert "no stream belt/imu; it holds imu/imu, radar/frame" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    cane.write_text(text)
+    done = caneflow("run", cane, "--replay", tmp_path / "nowhere.mcap")
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
