@@ -1,10 +1,10 @@
-# One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make bench`.
+# One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make docs`, `make bench`.
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 WALK := build/walk.mcap
 
-.PHONY: run test lint bench clean
+.PHONY: run test lint docs bench clean
 
 # The environment is made once, and again when the project's needs change.
 $(BIN)/.installed: pyproject.toml
@@ -28,6 +28,11 @@ lint: $(BIN)/.installed
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# What the pages say of messages and of dataflow.yaml is written from the code.
+docs: $(BIN)/.installed
+	$(BIN)/python -m caneflow.messages.reference docs
+	$(BIN)/python -m caneflow.runtime.yaml_reference docs
 
 bench: $(BIN)/.installed
 	$(BIN)/pytest --benchmark-enable --benchmark-only

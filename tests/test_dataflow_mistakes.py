@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -486,7 +487,7 @@ def test_cycles_are_reported_exactly_when_a_node_reaches_itself(
 
 
 # A setting of each level, where a stray key may be put in.
-LEVELS: dict[str, tuple[str | int, ...]] = {
+LEVELS: dict[str, tuple[str, ...]] = {
     "": (),
     "rig": ("rig",),
     "rig.sensors.south": ("rig", "sensors", "south"),
@@ -517,7 +518,7 @@ def whole() -> dict[str, Any]:
     }
 
 
-def laid_out(value: Any, draw: st.DrawFn, indent: str = "") -> str:
+def laid_out(value: Any, draw: Callable[..., Any], indent: str = "") -> str:
     """`value` as YAML, each mapping in block or in flow style, with blank lines and comments where they may be."""
     if not isinstance(value, dict):
         return f"[{', '.join(map(str, value))}]\n" if isinstance(value, list) else f"{value}\n"

@@ -52,7 +52,7 @@ class AttitudeHistory:
         return _between(older, newer, (stamp_ns - older_ns) / (newer_ns - older_ns))
 
     def mean_turn_rate(self, start_ns: int, end_ns: int) -> float | None:
-        """Mean norm of the turn rate (rad/s) over the samples of `start_ns`..`end_ns`; None if there are not two."""
+        """Mean norm of the turn rate (rad/s) of the samples in `start_ns`..`end_ns`; None if there are not two."""
         first, last = bisect_left(self._stamps, start_ns), bisect_right(self._stamps, end_ns) - 1
         if last <= first:
             return None

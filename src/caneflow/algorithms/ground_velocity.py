@@ -146,6 +146,7 @@ class GroundVelocityEstimator:
         self._geometry = geometry
         self._window = PulsePairWindow(window=settings.window, cell=settings.cell)
         self.debug = None
+        self.dh=0.0; self.Ph=0.03**2; self.usevz=True; self.useh=True; self.sdz=0.02; self.corr=50.
 
     def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> VelocityEstimate:
         settings = self._settings
@@ -165,7 +166,10 @@ class GroundVelocityEstimator:
         geometry = self._geometry
         height = antenna_height(geometry, orientation)
         axis = pitch(geometry, orientation)
-        rise = (antenna_height(geometry, after) - antenna_height(geometry, before)) / (2 * delay)
+        hz, hv = self.heave.at((oldest_ns+newest_ns)//2)
+        rise = hv if self.usevz else (antenna_height(geometry, after) - antenna_height(geometry, before)) / (2 * delay)
+        if self.usevz: height = hz
+        height += self.dh
         sums = self._window.sums()
         sine = height / sums.ranges
         seen = (sine > math.sin(settings.shallowest)) & (sine < math.sin(settings.steepest))
@@ -191,19 +195,33 @@ class GroundVelocityEstimator:
         # start: weighted median of per-cell speeds
         v = phase / forward
         o = np.argsort(v); cw = np.cumsum((weight*forward**2)[o]); vf = v[o][np.searchsorted(cw, 0.5 * cw[-1])]
-        vz = 0.0
-        prior = 1.0 / settings.vertical_speed**2
+        vz = dh = 0.0
+        pz = 1.0 / self.sdz**2
+        ph = 1.0 / self.Ph
+        slope = per_speed * -np.tan(grazing) * sine / height
+        slope = slope * beam_factor(grazing, axis, geometry.aperture)
         for _ in range(4):
-            r = phase - forward * vf - vertical * vz
+            cols = np.stack([forward, vertical, slope * vf])
+            r = phase - vf * forward - vz * vertical - 0*dh * slope * vf
             w = weight / (1 + (r / settings.outlier) ** 2) ** 2 * 2
-            a = float((w * forward * forward).sum()); b = float((w * forward * vertical).sum()); c = float((w * vertical * vertical).sum()) + prior
-            p = float((w * forward * phase).sum()); q = float((w * vertical * phase).sum())
-            d = a * c - b * b
-            vf, vz = (c * p - b * q) / d, (a * q - b * p) / d
-        r = phase - forward * vf - vertical * vz
-        s2 = float((w * r * r).sum() / max(w.sum(), 1e-9)) * float((w>0).sum())/ max(float((w>0).sum())-2,1)
-        var = c / d 
-        self.debug.update(vz=vz + rise, s2=s2, var=var, lim=float(np.max(np.abs(forward * vf)))/math.pi, W=float(w.sum()))
+            N = np.einsum('ik,k,jk->ij', cols, w, cols)
+            y = np.einsum('ik,k,k->i', cols, w, phase)
+            N[1,1] += pz; N[2,2] += ph
+            vf, vz, dh = np.linalg.solve(N, y).tolist()
+            if not self.useh: dh = 0.0
+        C = np.linalg.inv(N)
+        r = phase - forward * vf - vertical * vz - slope*vf*dh
+        s2 = float((w * r * r).sum() / max(w.sum(), 1e-9))
+        var = float(C[0,0])
+        if self.useh:
+            info = max(1/C[2,2]-ph, 0)/self.corr
+            self.Ph += 0.002**2*period
+            K = info and self.Ph*info/(1+self.Ph*info)
+            # dh is the posterior mean with prior 0 of sd Ph; data-only value
+            data = dh*(1/C[2,2])/max(1/C[2,2]-ph,1e-9) if info else 0.
+            self.dh += K*data; self.Ph *= (1-K)
+        fit = float((np.abs(pairs)*np.cos(r)).sum())/total
+        self.debug.update(coh2=fit, vz=vz + rise, s2=s2, var=var, W=float(w.sum()), dh=self.dh)
         return VelocityEstimate(velocity=(vf, 0.0), covariance=(var, 0.0, UNOBSERVED), delay=delay, valid=True)
 
 

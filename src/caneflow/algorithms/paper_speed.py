@@ -159,15 +159,18 @@ class PaperSpeed:
     ) -> tuple[list[float], list[float]]:
         """Speed over ground (m/s, eq. 2) of the rays that show one, and the heights of their edges.
 
-        A ray shows one if its Doppler stands out of the noise `floor`, and if its edge lies well below the limit
-        of unambiguous Doppler.
+        A ray shows one if its Doppler stands out of the noise `floor`. None counts if the edges of many come near the
+        limit of unambiguous Doppler: the rest of them would tell of the slow part of the ground only.
         """
         settings = self._settings
         half = settings.transform // 2
         approaching = power[:, : half + 1]
         edges, falls = superior_edges(np.sqrt(approaching))
         shows = approaching.max(axis=1) > settings.least_peak * floor
-        shows &= edges < settings.alias_share * half
+        ambiguous = shows & (edges > settings.alias_share * half)
+        if 4 * np.count_nonzero(ambiguous) > settings.rays:
+            return [], []
+        shows &= ~ambiguous
         if settings.compensate_edge:
             cell = settings.transform / settings.window  # Doppler bins
             edges = np.maximum(edges - settings.edge_beyond_speed * cell, 0.0)

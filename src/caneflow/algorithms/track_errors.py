@@ -94,6 +94,21 @@ def track_errors(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0
     )
 
 
+def final_offset(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0, 0.0)) -> Floats:
+    """Where the estimate ends less where the truth ends (m, shape (2,)), both aligned as in `track_errors`.
+
+    In the estimate's own frame, which is that of its covariance; its length is `final_error`.
+    """
+    yaw = boresight_yaws(estimate.orientations, boresight)
+    truth_yaw = boresight_yaws(truth.orientations, boresight)
+    turn = _start_turn(estimate.stamps, yaw, truth_yaw)
+    times = (truth.stamps - estimate.stamps[0]) * 1e-9
+    ends = np.array([0.0, (estimate.stamps[-1] - estimate.stamps[0]) * 1e-9])
+    path = np.stack([np.interp(ends, times, truth.positions[:, axis]) for axis in (0, 1)], axis=1)
+    offset: Floats = (estimate.positions[-1] - estimate.positions[0])[:2] - _turned(path[1:] - path[:1], -turn)[0]
+    return offset
+
+
 def boresight_yaws(orientations: Floats, boresight: Vector) -> Floats:
     """Yaw (rad, shape (n,)) of a body vector for orientations, shape (n, 4)."""
     w, x, y, z = np.asarray(orientations, dtype=np.float64).T

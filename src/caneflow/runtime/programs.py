@@ -7,7 +7,7 @@ import pkgutil
 import re
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from contextlib import redirect_stdout
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
@@ -97,13 +97,18 @@ def validated_settings(program: Program, settings: Mapping[str, Any]) -> Any:
 def check_settings(program: Program, settings: Mapping[str, Any]) -> tuple[Any, list[Mistake]]:
     """`settings` as the program's Settings, or None and what is wrong with them."""
     try:
-        return _checked(program.Settings)(settings)
+        return _checked(program)(settings)
     except Exception as error:  # a check of its own that breaks: users' code may raise anything
         return None, [Mistake((), f"{program.Settings.__qualname__} breaks on these: {_cause(error)}")]
 
 
-@lru_cache(maxsize=64)
-def _checked(kind: type[Any]) -> Checked[Any]:
+def _checked(program: Program) -> Checked[Any]:
+    kind: Any = program.Settings
+    return _checked_kind(kind)
+
+
+@lru_cache(maxsize=64)  # preparing a check costs as much as the rest of a load
+def _checked_kind(kind: Hashable) -> Checked[Any]:
     return Checked(kind)
 
 
@@ -189,7 +194,7 @@ def _check_tables(run: str, program: Program) -> None:
             if not (inspect.isclass(kind) and issubclass(kind, Sample)):
                 raise DataflowError(f"{where}[{shown(port)}] is {shown(kind)}; it takes a class of messages")
     try:
-        _checked(program.Settings)
+        _checked(program)
     except Exception as error:  # pydantic has a dozen ways to say that it cannot check a type
         raise DataflowError(
             f"{shown(run)}: {program.__name__}.Settings cannot be checked: {one_line(error)}"

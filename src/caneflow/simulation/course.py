@@ -16,7 +16,7 @@ Shape: TypeAlias = Literal["loop", "straight", "figure_eight"]
 
 _STEP = 0.005  # m between the nodes of the splines, about
 _EASING = 0.15  # m over which a walker leads into a bend (chosen: a third of a step)
-_LEAD = 1.0  # m of straight before the first corner, so that a walk does not start within a bend
+_LEAD = 1.0  # m of straight between the last corner and the start, so that no walk starts within a bend
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _loop(length: float, width: float, radius: float) -> Floats:
     along, across = length + saved - 2.0 * radius, width + saved - 2.0 * radius
     if min(along - _LEAD, across) < 4.0 * _EASING:
         raise ValueError(f"corners of radius {radius} m do not fit into a loop of {length} x {width} m")
-    ends = np.cumsum([0.0, _LEAD, arc, across, arc, along, arc, across, arc, along - _LEAD])
+    ends = np.cumsum([0.0, along - _LEAD, arc, across, arc, along, arc, across, arc, _LEAD])
     turned = 0.5 * np.pi * np.array([0, 0, 1, 1, 2, 2, 3, 3, 4, 4])
     return np.interp(np.linspace(0.0, ends[-1], 100_001), ends, turned)
 

@@ -254,7 +254,8 @@ def _steps(
     begun = [float(np.interp(leg.start, time, made)) for leg in legs]
     ended = [float(np.interp(leg.end, time, made)) for leg in legs]
     whole = [max(1, round(end - begin)) for begin, end in zip(begun, ended, strict=True)]
-    whole[-1] += sum(whole) % 2
+    odd = sum(whole[:-1]) % 2
+    whole[-1] = max(2 - odd, odd + 2 * round(0.5 * (ended[-1] - begun[-1] - odd)))
     steps = np.zeros_like(made)
     for begin, end, count in zip(begun, ended, whole, strict=True):
         steps += count * (np.clip(made, begin, end) - begin) / (end - begin)

@@ -1,0 +1,278 @@
+"""Messages on the wire: what goes out comes back, what breaks the contract is refused with one clear cause."""
+
+import math
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from caneflow.messages import (
+    MAX_PAYLOAD,
+    SAMPLES,
+    DopplerBlock,
+    DopplerTarget,
+    GroundSpeed,
+    Imu,
+    MessageError,
+    Pose,
+    RadarFrame,
+    Sample,
+    control_key,
+    decode,
+    encode,
+    json_schema,
+    numbered,
+    sample_key,
+    stream_of,
+)
+from caneflow.messages.arrays import LITTLE_ENDIAN, from_bytes, to_bytes
+from caneflow.messages.reference import with_tables
+
+EXAMPLES: list[Sample] = [
+    Imu(
+        stamp=5,
+        gyro=(0.1, -0.2, 0.3),
+        accel=(0.0, 0.0, 9.81),
+        mag=(20.0, 0.0, -40.0),
+        orientation=(1.0, 0.0, 0.0, 0.0),
+        linear_accel=(0.0, 0.0, 0.0),
+        calibration=(3, 3, 3, 0),
+    ),
+    Imu(stamp=6, gyro=(0.0, 0.0, 0.0)),
+    RadarFrame(
+        stamp=7,
+        scans=np.arange(12, dtype=np.int32).reshape(2, 6),
+        scan_period=0.01,
+        range_start=0.5,
+        range_step=0.009149,
+        carrier=4.3e9,
+        bandwidth=1.7e9,
+    ),
+    GroundSpeed(stamp=8, speed=0.0, quality=math.inf, rays=0, valid=False),
+    GroundSpeed(
+        stamp=9, speed=1.1, quality=0.05, rays=12, valid=True, delay=0.32,
+        velocity=(1.0, 0.1), velocity_cov=(0.01, 0.0, 1e6), velocity_delay=0.03,
+    ),
+    Pose(
+        stamp=10, position=(1.0, 2.0, 3.0), velocity=(0.0, 0.0, 0.0), orientation=(0.0, 0.0, 0.0, 1.0),
+        method="luenberger", covariance=np.eye(6),
+    ),
+    DopplerBlock(
+        stamp=11, samples=np.array([1 + 2j, 3 - 1j], dtype=np.complex64), sample_rate=4000.0, carrier=24.125e9
+    ),
+    DopplerTarget(
+        stamp=12, range_rate=-1.2, signed=True, amplitude=0.01, snr=20.0, valid=True, range=4.0, delay=0.128
+    ),
+]  # fmt: skip
+
+
+def independent(payload: bytes) -> Any:
+    """The payload as another msgpack library reads it, arrays by the letter of the contract."""
+
+    def array(code: int, data: bytes) -> Any:
+        assert code == 1
+        rank = data[1]
+        shape = struct.unpack_from(f"<{rank}I", data, 2)
+        widths = {"B": "u1", "h": "i2", "i": "i4", "q": "i8", "f": "f4", "d": "f8", "F": "c8", "D": "c16"}
+        return np.frombuffer(data, "<" + widths[chr(data[0])], offset=2 + 4 * rank).reshape(shape)
+
+    return msgpack.unpackb(payload, ext_hook=array)
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda m: type(m).__name__)
+def test_what_goes_out_comes_back_the_same(message: Sample) -> None:
+    payload = numbered(message, 3)
+    again = decode(payload, type(message))
+    assert again.seq == 3
+    assert encode(again) == payload
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda m: type(m).__name__)
+def test_another_library_reads_the_same_map(message: Sample) -> None:
+    found = independent(numbered(message, 3))
+    assert isinstance(found, dict)
+    for name, value in found.items():
+        mine = getattr(message, name)
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, mine)
+            assert value.dtype == mine.dtype
+        else:
+            assert value == (list(mine) if isinstance(mine, tuple) else mine)
+    absent = {name for name in message.__struct_fields__ if getattr(message, name) is None}
+    assert not absent & found.keys(), "absent optional fields are left out"
+
+
+@pytest.mark.parametrize("kind", SAMPLES.values(), ids=lambda k: k.__name__)
+def test_what_another_library_writes_is_read(kind: type[Sample]) -> None:
+    message = next(m for m in EXAMPLES if type(m) is kind)
+    fields = independent(numbered(message, 0))
+    fields["unknown_to_us"] = {"deep": [1, 2]}  # a later version's field
+    fields["seq"] = 7
+
+    def default(value: object) -> msgpack.ExtType:
+        assert isinstance(value, np.ndarray)
+        return msgpack.ExtType(1, to_bytes(value))
+
+    assert decode(msgpack.packb(fields, default=default), kind).seq == 7
+
+
+def fields_of(message: Sample, **changes: object) -> bytes:
+    fields = {**independent(numbered(message, 0)), **changes}
+    fields = {name: value for name, value in fields.items() if value is not ...}
+    return bytes(msgpack.packb(fields, default=lambda a: msgpack.ExtType(1, to_bytes(a))))
+
+
+IMU, FRAME, SPEED, POSE = EXAMPLES[0], EXAMPLES[2], EXAMPLES[4], EXAMPLES[5]
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("message", "changes", "cause"),
+    [
+        (IMU, {"gyro": ...}, "missing required field `gyro`"),
+        (IMU, {"seq": ...}, "seq is missing"),
+        (IMU, {"seq": -4}, "seq is -4"),
+        (IMU, {"seq": 1.5}, "Expected `int`, got `float` - at `$.seq`"),
+        (IMU, {"stamp": -1}, "Expected `int` >= 0 - at `$.stamp`"),
+        (IMU, {"stamp": 2**63}, "stamp"),
+        (IMU, {"stamp": "now"}, "Expected `int`, got `str` - at `$.stamp`"),
+        (IMU, {"gyro": [1.0, 2.0]}, "Expected `array` of length 3"),
+        (IMU, {"gyro": [1.0, 2.0, "x"]}, "Expected `float`, got `str`"),
+        (IMU, {"gyro": [1.0, NAN, 2.0]}, "gyro is (1.0, nan, 2.0); NaN and infinity are not allowed"),
+        (IMU, {"accel": [math.inf, 0, 0]}, "accel is (inf, 0.0, 0.0)"),
+        (IMU, {"orientation": [1.0, 1.0, 0.0, 0.0]}, "orientation has norm 1.41421"),
+        (IMU, {"orientation": [NAN, 0.0, 0.0, 0.0]}, "orientation has norm nan"),
+        (IMU, {"calibration": [3, 3, 3, 9]}, "levels are 0..3"),
+        (FRAME, {"scans": np.zeros((2, 6))}, "scans is of dtype float64; allowed are int16, int32, float32"),
+        (FRAME, {"scans": np.zeros(6, np.int32)}, "scans has shape (6,); it takes 2 dimensions"),
+        (FRAME, {"scans": np.zeros((0, 6), np.int32)}, "none of them empty"),
+        (FRAME, {"scans": np.full((1, 2), np.nan, np.float32)}, "scans has elements that are NaN"),
+        (FRAME, {"scans": [1, 2]}, "Expected `numpy.ndarray`, got `list` - at `$.scans`"),
+        (FRAME, {"scan_period": 0.0}, "Expected `float` > 0.0 - at `$.scan_period`"),
+        (FRAME, {"range_start": NAN}, "range_start"),
+        (SPEED, {"quality": NAN}, "quality is nan"),
+        (SPEED, {"quality": -0.1}, "quality is -0.1"),
+        (SPEED, {"speed": math.inf}, "speed is (inf,)"),
+        (SPEED, {"valid": 1}, "Expected `bool`, got `int`"),
+        (SPEED, {"velocity_cov": [-1.0, 0.0, 1.0]}, "variances are 0 or more"),
+        (POSE, {"covariance": np.eye(5)}, "covariance has shape (5, 5), not (6, 6)"),
+        (POSE, {"method": None}, "Expected `str`, got `None`"),
+    ],
+)  # fmt: skip
+def test_what_breaks_the_contract_is_refused_by_name(message: Sample, changes: dict[str, Any], cause: str) -> None:
+    with pytest.raises(MessageError) as caught:
+        decode(fields_of(message, **changes), type(message))
+    assert cause in str(caught.value)
+
+
+def test_truncated_trailing_oversized_and_foreign_bytes_are_refused() -> None:
+    good = numbered(IMU, 0)
+    for bad in (good[:-1], good + b"\x00", b"", bytes(MAX_PAYLOAD + 1), b"\x90", encode(IMU)[1:], b"\x81" * 5000):
+        with pytest.raises(MessageError):
+            decode(bad, Imu)
+
+
+def test_a_sample_of_another_type_is_refused() -> None:
+    with pytest.raises(MessageError, match="missing required field"):
+        decode(numbered(POSE, 0), Imu)
+
+
+@given(st.binary(max_size=300))
+def test_no_bytes_raise_anything_but_a_message_error(payload: bytes) -> None:
+    for kind in SAMPLES.values():
+        with pytest.raises(MessageError):
+            decode(payload, kind)
+
+
+@given(st.data())
+def test_no_damage_to_a_good_sample_raises_anything_but_a_message_error(data: st.DataObject) -> None:
+    message = data.draw(st.sampled_from(EXAMPLES))
+    payload = bytearray(numbered(message, 1))
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        again = decode(bytes(payload), type(message))
+    except MessageError:
+        return
+    decode(encode(again), type(message))  # whatever was taken can be sent on
+
+
+arrays = st.sampled_from(sorted(LITTLE_ENDIAN)).flatmap(
+    lambda letter: hnp.arrays(LITTLE_ENDIAN[letter], hnp.array_shapes(min_dims=1, max_dims=4, max_side=4))
+)
+
+
+@given(arrays)
+def test_arrays_come_back_bit_by_bit(array: np.ndarray[Any, Any]) -> None:
+    again = from_bytes(memoryview(to_bytes(array)))
+    assert again.dtype == array.dtype
+    assert again.shape == array.shape
+    assert again.tobytes() == array.tobytes()
+
+
+def test_arrays_in_other_orders_come_back_in_c_order() -> None:
+    array = np.arange(6, dtype=np.float32).reshape(2, 3)
+    for view in (array.T, array[::-1], array.astype(">f4")):
+        np.testing.assert_array_equal(from_bytes(memoryview(to_bytes(view))), view)
+
+
+def test_arrays_that_the_wire_lacks_are_not_sent() -> None:
+    for bad in (np.zeros(3, np.uint16), np.array(["x"]), np.zeros((1, 1, 1, 1, 1)), np.float64(3.0)):
+        with pytest.raises(MessageError):
+            to_bytes(np.asarray(bad))
+
+
+@given(st.binary(max_size=60))
+def test_no_bytes_make_an_array_that_is_not_there(data: bytes) -> None:
+    try:
+        array = from_bytes(memoryview(data))
+    except MessageError:
+        return
+    assert array.nbytes <= len(data)
+
+
+def test_a_number_that_numpy_made_is_no_plain_number() -> None:
+    careless: Any = np.float32(1.0)
+    with pytest.raises(MessageError, match=r"call \.item\(\)"):
+        encode(GroundSpeed(stamp=1, speed=careless, quality=0.0, rays=1, valid=True))
+
+
+@pytest.mark.parametrize("kind", SAMPLES.values(), ids=lambda k: k.__name__)
+def test_the_json_schema_names_every_field_and_demands_the_required_ones(kind: type[Sample]) -> None:
+    schema = json_schema(kind)
+    assert schema["title"] == kind.schema
+    assert set(schema["properties"]) == set(kind.__struct_fields__)
+    assert {"stamp", "seq"} <= set(schema["required"])
+    optional = {name for name, spec in schema["properties"].items() if "default" in spec}
+    assert optional == set(kind.__struct_fields__) - set(schema["required"])
+
+
+def test_keys_are_built_and_taken_apart() -> None:
+    assert sample_key("cane", "imu", "imu") == "cane/imu/imu"
+    assert control_key("cane", "progress", "imu") == "cane/@/progress/imu"
+    assert stream_of("elsewhere/radar/frame") == ("radar", "frame")
+    with pytest.raises(ValueError, match="no sample's key"):
+        stream_of("cane/@/start")
+
+
+@pytest.mark.parametrize("message", [IMU, FRAME], ids=["Imu", "RadarFrame"])
+def test_encode_cost(benchmark: Any, message: Sample) -> None:
+    benchmark(numbered, message, 1)
+
+
+@pytest.mark.parametrize("message", [IMU, FRAME], ids=["Imu", "RadarFrame"])
+def test_decode_cost(benchmark: Any, message: Sample) -> None:
+    benchmark(decode, numbered(message, 1), type(message))
+
+
+def test_the_page_of_messages_says_what_the_code_does() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "messages.md").read_text(encoding="utf-8")
+    assert page == with_tables(page), "run: make docs"
+    assert set(re.findall(r"<!-- table (\w+) -->", page)) == {kind.__name__ for kind in SAMPLES.values()}

@@ -1,0 +1,13 @@
+"""The house: every room is installed, and the settings of the tools agree."""
+
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_every_room_is_packaged() -> None:
+    packages = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    rooms = {f"caneflow.{path.parent.name}" for path in (ROOT / "src" / "caneflow").glob("*/__init__.py")}
+    programs = {f"caneflow.{room}" for room in ("operators", "drivers", "tools")}
+    assert packages == {"caneflow"} | rooms | programs

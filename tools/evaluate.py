@@ -1,0 +1,212 @@
+"""`caneflow eval`: the methods of a flow's estimator side by side over recordings."""
+
+import csv
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import track
+
+from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
+from caneflow.runtime.dataflow import load
+from caneflow.runtime.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated
+
+FAILED_STATUS = 1
+
+# Figure -> its head, its unit and how many digits are worth reading.
+COLUMNS = {
+    "final_distance": ("end-start", "m", 3),
+    "final_error": ("end error", "m", 3),
+    "ate": ("ATE", "m", 3),
+    "rpe": ("RPE", "m", 3),
+    "drift_percent": ("drift", "%", 2),
+    "path_length_ratio": ("path", "ratio", 3),
+    "extent": ("extent", "ratio", 3),
+    "nees": ("NEES", "", 2),
+}
+NOTES = """\
+end-start: from where the track ends to where it starts, the paper's error; none but on a closed walk.
+end error, ATE, RPE over 1 m: against the truth, horizontal, aligned at the start's position and yaw only.
+sd with n - 1; growth: mean over the mean duration of the tracks, rests included; paper: Table I, ten walks.
+NEES: of the final horizontal position, 2 on average when the covariance is right."""
+
+By = dict[str, dict[str, Figures]]  # method, recording as given
+
+
+def command(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(metavar="REC...", help="Recordings, e.g. with ground truth.", show_default=False),
+    ],
+    methods: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="What to compare; by default all that fusion offers."),
+    ] = None,
+    flow: Annotated[Path, typer.Option(metavar="FILE", help="The dataflow.")] = Path("dataflow.yaml"),
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting (may be given again)."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="How many recordings at a time.")] = 1,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object: method, recording, figure.")
+    ] = False,
+    csv_file: Annotated[
+        Path | None,
+        typer.Option("--csv", metavar="FILE", help="Write a row per method and recording as well."),
+    ] = None,
+) -> None:
+    """Run the methods of `fusion` over recordings, all in one process each, and hold them against the truth.
+
+    Without truth in a recording only the distance between end and start is known. Exit status 1: some recording
+    or method failed; the others are there.
+
+    Example: caneflow eval walks/*.mcap --methods luenberger,best --jobs 2
+    """
+    wanted = [word.strip() for word in methods.split(",")] if methods is not None else []
+    chosen = chosen_methods(load(flow, settings or ()), wanted)
+    recordings = list(dict.fromkeys(recordings))
+    results = evaluated(flow, recordings, chosen, overrides=settings or (), jobs=jobs)
+    done = list(_shown(results, len(recordings)))
+    by_method = gathered(chosen, done)
+    if as_json:
+        print(json.dumps(by_method, indent=2, allow_nan=False))
+    else:
+        print("\n".join(lines(by_method)))
+    if csv_file is not None:
+        write_csv(by_method, csv_file)
+    failures = [line for result in done for line in failed(result)]
+    for line in failures:
+        print(f"caneflow eval: {line}", file=sys.stderr)
+    if failures:
+        raise typer.Exit(FAILED_STATUS)
+
+
+def gathered(methods: Sequence[str], results: Sequence[Evaluation]) -> By:
+    """The figures by method, then by recording as it was given; what failed is not there."""
+    return {
+        method: {str(each.recording): each.figures[method] for each in results if method in each.figures}
+        for method in methods
+    }
+
+
+def failed(result: Evaluation) -> Iterator[str]:
+    """A line for each reason why a method says nothing of a recording."""
+    by_reason: dict[str, list[str]] = {}
+    for method, reason in result.failures.items():
+        by_reason.setdefault(reason, []).append(method)
+    for reason, methods in by_reason.items():
+        where = "" if len(by_reason) == 1 and not result.figures else f"{', '.join(methods)}: "
+        named = reason.startswith(str(result.recording))
+        yield f"{where}{reason}" if named else f"{result.recording}: {where}{reason}"
+
+
+def write_csv(by_method: By, path: Path) -> None:
+    """A row per method and recording with every figure; what is not known is empty."""
+    with path.open("w", encoding="utf-8", newline="") as text:
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow(("method", "recording", *FIGURES))
+        for method, by_recording in by_method.items():
+            for recording, figures in by_recording.items():
+                rows.writerow((method, recording, *(figures[name] for name in FIGURES)))
+
+
+def lines(by_method: By) -> Iterator[str]:
+    """The table of all walks, then Table I's rows, then what the columns mean."""
+    yield from _aligned(_walks(by_method), left=2)
+    yield ""
+    yield from _aligned(_summary(by_method), left=2)
+    yield ""
+    yield NOTES
+    walks = max(sum(figures["nees"] is not None for figures in each.values()) for each in by_method.values())
+    if walks:
+        low, high = consistent_mean(walks)
+        yield f"Over {walks} walks its mean lies within {low:.2f} .. {high:.2f} in 95 % of all cases then."
+
+
+def _walks(by_method: By) -> Iterator[Sequence[str]]:
+    yield "recording", "method", *(head for head, _, _ in COLUMNS.values())
+    yield "", "", *(unit for _, unit, _ in COLUMNS.values())
+    recordings = dict.fromkeys(recording for each in by_method.values() for recording in each)
+    for recording in recordings:
+        name = Path(recording).stem
+        for method, by_recording in by_method.items():
+            if recording in by_recording:
+                figures = by_recording[recording]
+                yield name, method, *(_number(figures[key], digits) for key, (_, _, digits) in COLUMNS.items())
+                name = ""
+
+
+def _summary(by_method: By) -> Iterator[Sequence[str]]:
+    yield (
+        "method",
+        "",
+        "walks",
+        "end-start max",
+        "sd",
+        "mean",
+        "growth",
+        "end error max",
+        "sd",
+        "mean",
+        "ATE",
+        "NEES",
+    )
+    yield "", "", "", "m", "m", "m", "m/s", "m", "m", "m", "mean, m", "mean"
+    for method, by_recording in by_method.items():
+        all_figures = list(by_recording.values())
+        if all_figures:
+            known = [figures for figures in all_figures if figures["final_error"] is not None]
+            yield (
+                *(method, "here", str(len(all_figures))),
+                *_table_one(_summarized(all_figures, "final_distance"), growth=True),
+                *_table_one(_summarized(known, "final_error") if known else None),
+                *(_mean(all_figures, "ate", 3), _mean(all_figures, "nees", 2)),
+            )
+        if method in TABLE_I:
+            yield "", "paper", "10", *_table_one(TABLE_I[method], growth=True), *[""] * 5
+
+
+def _summarized(all_figures: Sequence[Figures], name: str) -> ErrorSummary:
+    errors = [figures[name] or 0.0 for figures in all_figures]
+    return summarized(errors, [figures["duration"] or 0.0 for figures in all_figures])
+
+
+def _table_one(summary: ErrorSummary | None, *, growth: bool = False) -> list[str]:
+    if summary is None:
+        return ["-"] * 3
+    figures = [_number(summary.largest, 2), _number(summary.sd, 2), _number(summary.mean, 2)]
+    return [*figures, _number(summary.growth_rate, 3)] if growth else figures
+
+
+def _mean(all_figures: Sequence[Figures], name: str, digits: int) -> str:
+    known = [value for figures in all_figures if (value := figures[name]) is not None]
+    return _number(sum(known) / len(known) if known else None, digits)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _aligned(rows: Iterator[Sequence[str]], left: int) -> Iterator[str]:
+    """Rows as lines: the first `left` columns flush left, the others flush right."""
+    table = list(rows)
+    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
+    for row in table:
+        cells = [
+            cell.ljust(width) if column < left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        yield "  ".join(cells).rstrip()
+
+
+def _shown(results: Iterator[Evaluation], total: int) -> Iterator[Evaluation]:
+    """The same, with a bar on a terminal and nothing elsewhere."""
+    console = Console(stderr=True)
+    return iter(
+        track(results, "recordings", total=total, console=console, transient=True, disable=not console.is_terminal)
+    )
