@@ -60,15 +60,6 @@ def test_a_stream_that_never_speaks_but_ends_holds_nobody_up() -> None:
     assert merge.handled() == END
 
 
-def test_going_on_without_a_port_frees_one_stamp_only() -> None:
-    merge = Merge(["a", "b"])
-    merge.push("a", sample(5))
-    merge.push("a", sample(9))
-    merge.go_on_without("b")
-    assert drained(merge) == [("a", 5)]
-    assert merge.watermark("b") == 4  # b is later in port order: it may still bring 5 itself
-
-
 def test_handled_is_what_can_cause_nothing_any_more() -> None:
     merge = Merge(["a", "b"])
     merge.push("a", sample(7))

@@ -1,5 +1,6 @@
-"""The real command with real processes over loopback Zenoh: start, replay, record, kill, interrupt, lose nothing."""
+"""The real command with real processes over loopback Zenoh: started, replayed, recorded, killed, interrupted."""
 
+import itertools
 import os
 import re
 import signal
@@ -276,7 +277,7 @@ def test_a_loop_goes_on_with_stamps_and_numbers(
         assert recording.complete
         poses = [(s.seq, s.stamp) for s in recording.samples([("fusion", "pose")])]
     assert [seq for seq, _ in poses] == list(range(len(poses)))
-    spacing = {b - a for (_, a), (_, b) in zip(poses, poses[1:], strict=False)}
+    spacing = {b - a for (_, a), (_, b) in itertools.pairwise(poses)}
     assert spacing == {10_000_000}, "the next turn begins one sample after the last"
 
 
@@ -454,3 +455,106 @@ def test_an_unfit_recording_is_refused_in_one_line(cane: Path, walk: Path, tmp_p
     done = caneflow("run", cane, "--replay", tmp_path / "nowhere.mcap")
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+LAGGING = '''
+"""A live source whose samples reach the graph 0.3 s after they were taken, and for a while now and then 0.9 s."""
+import collections
+import time
+from caneflow.messages import GroundSpeed
+from caneflow.runtime import Source
+from caneflow.runtime.node import run
+
+class Lagging(Source):
+    outputs = {"speed": GroundSpeed}
+
+    def __init__(self, settings, context):
+        pass
+
+    def samples(self):
+        waiting = collections.deque()
+        number = 0
+        while True:
+            time.sleep(0.01)
+            now = time.time_ns()
+            waiting.append((now, now + (900 if number % 100 < 30 else 300) * 1_000_000))
+            number += 1
+            while waiting and waiting[0][1] <= now:
+                stamp, _ = waiting.popleft()
+                yield "speed", GroundSpeed(stamp=stamp, speed=1.0, quality=0.0, rays=1, valid=True)
+
+if __name__ == "__main__":
+    run(Lagging)
+'''
+
+JOIN = '''
+"""Says for each IMU sample how many speeds came before it: an order that depends on what is late."""
+from caneflow.messages import GroundSpeed, Imu
+from caneflow.runtime import Operator
+from caneflow.runtime.node import run
+
+class Join(Operator):
+    inputs = {"imu": Imu, "speed": GroundSpeed}
+    outputs = {"count": GroundSpeed}
+
+    def __init__(self, settings, context):
+        self.speeds = 0
+
+    def handle(self, port, message):
+        if port == "speed":
+            self.speeds += 1
+        else:
+            yield "count", GroundSpeed(stamp=message.stamp, speed=0.0, quality=0.0, rays=self.speeds, valid=True)
+
+if __name__ == "__main__":
+    run(Join)
+'''
+
+
+def test_a_live_run_goes_on_without_what_lags_and_its_recording_knows(
+    tmp_path: Path, flow: str, start: Callable[..., Running]
+) -> None:
+    for name, text in {"ticker": TICKER, "lagging": LAGGING, "join": JOIN}.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    file = tmp_path / "late.yaml"
+    file.write_text(
+        f"flow: {flow}\n"
+        "nodes:\n"
+        "  ticker: {run: ./ticker.py}\n"
+        "  lagging: {run: ./lagging.py}\n"
+        "  join: {run: ./join.py, inputs: {imu: ticker/imu, speed: {from: lagging/speed, max_lag_ms: 500}}}\n"
+        "results: [join/count]\n"
+    )
+    out = tmp_path / "out.mcap"
+    running = start("run", file, "--record", out)
+    with running.session() as session:
+        for counted in counters(session, running.flow, "join"):
+            if counted.inputs["speed"].late > 20 and counted.inputs["speed"].handled > 20:
+                break
+    status, output = running.end(signal.SIGINT)
+    assert status == 130, output
+    with Recording(out) as recording:
+        assert recording.control[control_key(flow, "late")] > 20
+    done = caneflow("verify", file, out)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "samples equal in every byte" in done.stdout
+
+
+def test_verify_names_the_first_difference(cane: Path, walk: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    done = caneflow("run", cane, "--replay", walk, "--in-process", "--record", out)
+    assert done.returncode == 0, done.stderr
+    assert caneflow("verify", cane, out).returncode == 0
+    other = ["--set", "fusion.luenberger.pole_acceleration=0.500001"]
+    done = caneflow("verify", cane, out, *other)
+    assert done.returncode == 1
+    assert "ground_speed/speed: 400 of 400 samples equal in every byte" in done.stdout
+    assert re.search(
+        r"fusion/pose: differs at seq \d+ \(stamp \d+\): (position|velocity) was \(.*\), is \(", done.stdout
+    )
+    done = caneflow("verify", cane, out, *other, "--tolerance", "0.01")
+    assert done.returncode == 0, done.stdout
+    assert "within the tolerance (largest " in done.stdout
+    done = caneflow("verify", cane, walk)
+    assert done.returncode == 2
+    assert "holds no output of" in done.stderr

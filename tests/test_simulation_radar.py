@@ -38,7 +38,7 @@ def standing(count: int) -> Motion:
     """A cane held still for `count` scans."""
     zeros = np.zeros((count, 3))
     q = attitude.from_angles(np.zeros(count), np.full(count, PITCH), np.zeros(count))
-    place = zeros + [0.0, 0.0, 0.75]
+    place = zeros + np.array([0.0, 0.0, 0.75])
     time = np.arange(count) / 100.0
     return Motion(time, place, zeros, zeros, q, zeros, place, zeros[:, 0], zeros[:, 0])
 
@@ -84,7 +84,7 @@ def test_the_pulse_has_1_7_ghz_between_its_10_db_points() -> None:
     wide = frequency[spectrum > 0.1 * spectrum.max()]
     assert frequency[spectrum.argmax()] == pytest.approx(4.3e9, rel=2e-3)
     assert wide[-1] - wide[0] == pytest.approx(1.7e9, rel=2e-2)
-    assert RANGE_STEP == pytest.approx(9.149e-3, abs=1e-6)
+    assert pytest.approx(9.149e-3, abs=1e-6) == RANGE_STEP
 
 
 def test_echoes_agree_with_the_slow_sum_over_pulses() -> None:

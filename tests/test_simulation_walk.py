@@ -29,8 +29,9 @@ def loop() -> Motion:
     return walk(MotionSettings(), Rig(), default_rng(3))
 
 
-def at_rest(motion: Motion) -> Floats:
-    return motion.distance[motion.time < 2.0]
+@pytest.fixture(scope="module")
+def quiet() -> Motion:
+    return walk(QUIET, Rig(), default_rng(0))
 
 
 def as_scipy(orientation: Floats) -> Rotation:
@@ -108,7 +109,7 @@ def test_heading_is_the_direction_of_travel() -> None:
 
 
 def test_corners_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="radius 2.0 m do not fit into a loop of 8.0 x 3.0 m"):
+    with pytest.raises(ValueError, match=r"radius 2\.0 m do not fit into a loop of 8\.0 x 3\.0 m"):
         course("loop", 8.0, 3.0, 2.0, 1, False)
 
 
@@ -150,23 +151,21 @@ def test_the_cane_turns_about_the_hand(loop: Motion) -> None:
     assert loop.position + to_hand == pytest.approx(loop.hand, abs=1e-12)
 
 
-def test_steps_are_whole_even_and_of_the_length_asked_for() -> None:
-    motion = walk(QUIET, Rig(), default_rng(0))
-    assert motion.steps[-1] == pytest.approx(round(motion.steps[-1]), abs=1e-6)
-    assert round(motion.steps[-1]) % 2 == 0
-    cruising = (motion.time > 5.0) & (motion.time < 8.0)
-    length = np.ptp(motion.distance[cruising]) / np.ptp(motion.steps[cruising])
+def test_steps_are_whole_even_and_of_the_length_asked_for(quiet: Motion) -> None:
+    assert quiet.steps[-1] == pytest.approx(round(quiet.steps[-1]), abs=1e-6)
+    assert round(quiet.steps[-1]) % 2 == 0
+    cruising = (quiet.time > 5.0) & (quiet.time < 8.0)
+    length = np.ptp(quiet.distance[cruising]) / np.ptp(quiet.steps[cruising])
     assert length == pytest.approx(0.42, rel=0.03)
 
 
-def test_the_cane_swings_by_20_deg_once_a_step_at_42_deg_of_pitch() -> None:
-    motion = walk(QUIET, Rig(), default_rng(0))
-    straight = (motion.time > 4.0) & (motion.time < 14.0)  # within the first side: heading 0
-    yaw = attitude.yaw_of(motion.orientation)[straight]
+def test_the_cane_swings_by_20_deg_once_a_step_at_42_deg_of_pitch(quiet: Motion) -> None:
+    straight = (quiet.time > 4.0) & (quiet.time < 14.0)  # within the first side: heading 0
+    yaw = attitude.yaw_of(quiet.orientation)[straight]
     assert np.array([yaw.min(), yaw.max()]) / DEGREE == pytest.approx([-20.0, 20.0], abs=0.5)
     crossings = np.count_nonzero(np.diff(np.sign(yaw)))
-    assert crossings == pytest.approx(np.ptp(motion.steps[straight]), abs=1.0)
-    down = -attitude.rotate(motion.orientation, (0.0, 1.0, 0.0))[straight, 2]
+    assert crossings == pytest.approx(np.ptp(quiet.steps[straight]), abs=1.0)
+    down = -attitude.rotate(quiet.orientation, (0.0, 1.0, 0.0))[straight, 2]
     pitch = np.arcsin(down) / DEGREE
     assert pitch.max() == pytest.approx(42.0, abs=0.01)
     assert pitch.min() == pytest.approx(42.0 - 0.03 / (0.95 / np.sin(42.0 * DEGREE)) / DEGREE, abs=0.01)
@@ -179,11 +178,10 @@ def test_the_swing_stops_where_it_is_told_to() -> None:
     assert np.abs(yaw[motion.distance > 7.0]).max() < 0.01
 
 
-def test_corners_are_walked_more_slowly() -> None:
-    motion = walk(QUIET, Rig(), default_rng(0))
-    speed = np.gradient(motion.distance, 1.0 / RATE)
+def test_corners_are_walked_more_slowly(quiet: Motion) -> None:
+    speed = np.gradient(quiet.distance, 1.0 / RATE)
     assert np.median(speed) == pytest.approx(0.465, rel=0.01)
-    corner = speed[np.argmin(np.abs(motion.distance - (6.2 + 0.4)))]
+    corner = speed[np.argmin(np.abs(quiet.distance - (6.2 + 0.4)))]
     assert corner == pytest.approx(0.465 / 1.25, rel=0.05)
 
 

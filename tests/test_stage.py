@@ -138,7 +138,7 @@ def test_what_comes_after_the_graph_went_on_is_late() -> None:
     host.offer("a", imu(10, 0))
     assert emitted(host) == []
     assert host.held_by() == "b"
-    host.go_on_without("b")
+    host.go_on_without("b", until=10)
     assert emitted(host) == [(10, 0)]
     host.offer("b", imu(4, 0))
     host.offer("b", imu(12, 1))

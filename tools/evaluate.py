@@ -163,12 +163,14 @@ def _summary(by_method: By) -> Iterator[Sequence[str]]:
             known = [figures for figures in all_figures if figures["final_error"] is not None]
             yield (
                 *(method, "here", str(len(all_figures))),
-                *_table_one(_summarized(all_figures, "final_distance"), growth=True),
-                *_table_one(_summarized(known, "final_error") if known else None),
+                *_table_one(_summarized(all_figures, "final_distance")),
+                *(_table_one(_summarized(known, "final_error"))[:3] if known else ["-"] * 3),
                 *(_mean(all_figures, "ate", 3), _mean(all_figures, "nees", 2)),
             )
         if method in TABLE_I:
-            yield "", "paper", "10", *_table_one(TABLE_I[method], growth=True), *[""] * 5
+            paper = TABLE_I[method]
+            printed = (f"{value:g}" for value in (paper.largest, paper.sd, paper.mean, paper.growth_rate))
+            yield "", "paper", "10", *printed, *[""] * 5
 
 
 def _summarized(all_figures: Sequence[Figures], name: str) -> ErrorSummary:
@@ -176,11 +178,9 @@ def _summarized(all_figures: Sequence[Figures], name: str) -> ErrorSummary:
     return summarized(errors, [figures["duration"] or 0.0 for figures in all_figures])
 
 
-def _table_one(summary: ErrorSummary | None, *, growth: bool = False) -> list[str]:
-    if summary is None:
-        return ["-"] * 3
-    figures = [_number(summary.largest, 2), _number(summary.sd, 2), _number(summary.mean, 2)]
-    return [*figures, _number(summary.growth_rate, 3)] if growth else figures
+def _table_one(summary: ErrorSummary) -> list[str]:
+    errors = (summary.largest, summary.sd, summary.mean)
+    return [*(_number(error, 2) for error in errors), _number(summary.growth_rate, 3)]
 
 
 def _mean(all_figures: Sequence[Figures], name: str, digits: int) -> str:

@@ -49,26 +49,31 @@ class Picture:
     title: str
     origin: int  # ns
     boresight: Vector
-    in_a_room: bool  # positions are absolute: nothing is aligned
+    sensors: dict[str, tuple[float, float]]  # m, of a room; with them positions are absolute: nothing is aligned
     tracks: dict[str, Track] = field(default_factory=dict)  # by node/port and method
     truth: Track | None = None
-    truth_speed: Floats | None = None  # (n,) m/s, along the boresight's projection
+    truth_speed: Floats | None = None  # (n,) m/s, along the boresight's projection; a room has no boresight
     speeds: dict[str, Floats] = field(default_factory=dict)  # by node/port: (n, 3) of time, speed, quality
     doppler: tuple[Floats, Floats, Floats] | None = None  # times (n,), radial speeds (m,), power (m, n) in dB
 
     def seconds(self, track: Track) -> Floats:
         """Times (s) of a track's poses."""
-        return (track.stamps - self.origin) * 1e-9
+        since: Floats = (track.stamps - self.origin).astype(np.float64) * 1e-9
+        return since
 
-    def aligned(self, track: Track) -> NDArray[np.floating]:
+    def aligned(self, track: Track) -> Floats:
         """Positions (n, 2) m of a track laid on the truth: at its start and by its yaw there, as errors are."""
-        if self.truth is None or self.in_a_room:
+        if self.truth is None or self.sensors:
             return track.positions[:, :2]
         count = int(np.searchsorted(track.stamps, track.stamps[0] + START_NS))
-        yaws = (boresight_yaws(each.orientations[:count], self.boresight) for each in (self.truth, track))
-        turn = np.angle(np.mean(np.exp(1j * np.subtract(*yaws))))
-        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        return (track.positions[:, :2] - track.positions[0, :2]) @ rotation.T + self.true_positions(track)[0]
+        first = int(np.searchsorted(self.truth.stamps, track.stamps[0]))
+        true_yaws = boresight_yaws(self.truth.orientations[first : first + count], self.boresight)
+        yaws = boresight_yaws(track.orientations[: len(true_yaws)], self.boresight)
+        turn = float(np.angle(np.mean(np.exp(1j * (true_yaws - yaws)))))
+        x, y = (track.positions[:, :2] - track.positions[0, :2]).T
+        turned = np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y], axis=1)
+        moved: Floats = turned + self.true_positions(track)[0]
+        return moved
 
     def true_positions(self, track: Track) -> Floats:
         """Where the truth was (n, 2) m at the times of a track."""
@@ -76,10 +81,11 @@ class Picture:
         at, times = self.seconds(track), self.seconds(self.truth)
         return np.stack([np.interp(at, times, self.truth.positions[:, axis]) for axis in (0, 1)], axis=1)
 
-    def errors(self, track: Track) -> NDArray[np.floating]:
+    def errors(self, track: Track) -> Floats:
         """Distance (n,) m to the truth."""
         difference = self.aligned(track) - self.true_positions(track)
-        return np.hypot(difference[:, 0], difference[:, 1])
+        distance: Floats = np.hypot(difference[:, 0], difference[:, 1])
+        return distance
 
 
 def command(
@@ -105,20 +111,25 @@ def command(
 
 
 def summary(picture: Picture) -> Iterator[str]:
-    """A line per track: its errors against the truth, or its length when there is none."""
+    """A line per track: its errors against the truth, if there is one."""
     for name, track in picture.tracks.items():
         if picture.truth is None:
             yield f"{name}: {len(track.stamps)} poses; no ground truth to compare with"
-        elif picture.in_a_room:
+        elif picture.sensors:
             errors = picture.errors(track)
             yield f"{name}: error mean {errors.mean():.2f} m, max {errors.max():.2f} m, final {errors[-1]:.2f} m"
         else:
-            e = track_errors(track, picture.truth, boresight=picture.boresight)
-            drift = "" if e.drift_percent is None else f", drift {e.drift_percent:.1f} % of {e.length:.1f} m"
-            yield (
-                f"{name}: final error {e.final_error:.2f} m, ATE {e.ate:.2f} m, "
-                f"end to start {e.final_distance:.2f} m{drift}"
-            )
+            yield f"{name}: {_errors_of_a_walk(track, picture.truth, picture)}"
+
+
+def _errors_of_a_walk(track: Track, truth: Track, picture: Picture) -> str:
+    try:
+        e = track_errors(track, truth, boresight=picture.boresight)
+    except ValueError:  # only a part of the walk was run
+        seconds = picture.seconds(track)
+        return f"error {picture.errors(track)[-1]:.2f} m after {seconds[-1] - seconds[0]:.1f} s of the walk"
+    drift = "" if e.drift_percent is None else f", drift {e.drift_percent:.1f} % of {e.length:.1f} m"
+    return f"final error {e.final_error:.2f} m, ATE {e.ate:.2f} m, end to start {e.final_distance:.2f} m{drift}"
 
 
 def read_picture(path: Path) -> Picture:
@@ -137,19 +148,23 @@ def read_picture(path: Path) -> Picture:
             title=f"{path.name}   {recording.flow}, {recording.metadata.get('source', '')}",
             origin=span[0],
             boresight=cast("Vector", tuple(recording.rig.get("boresight", (0.0, 1.0, 0.0)))),
-            in_a_room="sensors" in recording.rig,
+            sensors=_sensors(recording.rig),
         )
         for stream in poses:
             track, _, method = _track(recording, stream)
             picture.tracks[f"{stream.node}/{stream.port} {method}"] = track
         if truth:
             picture.truth, velocities, _ = _track(recording, truth)
-            picture.truth_speed = _along_boresight(picture, velocities)
+            picture.truth_speed = None if picture.sensors else _along_boresight(picture, velocities)
         for stream in recording.streams_of(GroundSpeed):
             picture.speeds[f"{stream.node}/{stream.port}"] = _speeds(recording, stream, span[0])
         for stream in recording.streams_of(RadarFrame)[:1]:
             picture.doppler = _doppler(recording, stream, span[0])
     return picture
+
+
+def _sensors(rig: dict[str, Any]) -> dict[str, tuple[float, float]]:
+    return {name: (each["position"][0], each["position"][1]) for name, each in rig.get("sensors", {}).items()}
 
 
 def _track(recording: Recording, stream: Stream) -> tuple[Track, Floats, str]:
@@ -182,7 +197,7 @@ def _speeds(recording: Recording, stream: Stream, origin: int) -> Floats:
 
 
 def _doppler(recording: Recording, stream: Stream, origin: int) -> tuple[Floats, Floats, Floats] | None:
-    """Power over radial speed and time, all ranges together, what stands still taken off; None for too few scans."""
+    """Power over radial speed and time, all ranges together, without what stands still; None for too few scans."""
     window: deque[NDArray[Any]] = deque(maxlen=SLOW_TIME)
     times: list[float] = []
     columns: list[Floats] = []
@@ -220,16 +235,14 @@ def _spectrum(scans: NDArray[Any], frame: RadarFrame) -> Floats:
 def draw(picture: Picture) -> "Figure":
     """The figure: the track on the left, time series on the right, as many as there are data for."""
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
         raise CaneflowError(f"no {error.name} here; `pip install 'caneflow[plot]'` brings it") from error
 
     panels = list(_panels(picture))
     figure = Figure(figsize=(14, 7.5), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
     figure.suptitle(picture.title, x=0.01, ha="left", color=INK, fontsize=12)
-    grid = figure.add_gridspec(max(len(panels), 1), 2, width_ratios=(1.1, 1))
+    grid = figure.add_gridspec(max(len(panels), 1), 2, width_ratios=(1.1, 1 if panels else 1e-3))
     _draw_track(figure.add_subplot(grid[:, 0]), picture)
     first = None
     for row, panel in enumerate(panels):
@@ -263,6 +276,9 @@ def _draw_track(axes: "Axes", picture: Picture) -> None:
         axes.plot(x[-1], y[-1], "s", color=colour, markersize=7, zorder=6)
         if picture.truth is not None:
             axes.plot(*zip((x[-1], y[-1]), picture.true_positions(track)[-1], strict=True), ":", color=colour)
+    for name, (x, y) in picture.sensors.items():
+        axes.plot(x, y, "^", color=INK, markersize=9)
+        axes.annotate(f"  {name}", (x, y), color=INK, va="center")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x0, m")
     axes.set_ylabel("y0, m")
@@ -293,12 +309,8 @@ def _draw_speeds(axes: "Axes", picture: Picture) -> None:
 
 
 def _draw_errors(axes: "Axes", picture: Picture) -> None:
-    for (name, track), colour in zip(picture.tracks.items(), COLOURS * len(picture.tracks), strict=False):
-        errors = picture.errors(track)
-        axes.plot(picture.seconds(track), errors, color=colour, linewidth=1.4, label=name)
-        axes.annotate(
-            f"{errors[-1]:.2f} m", (picture.seconds(track)[-1], errors[-1]), color=colour, ha="right", va="bottom"
-        )
+    for track, colour in zip(picture.tracks.values(), COLOURS * len(picture.tracks), strict=False):
+        axes.plot(picture.seconds(track), picture.errors(track), color=colour, linewidth=1.4)
     axes.set_ylim(bottom=0)
     axes.set_ylabel("error, m")
     axes.grid(color="#eeeeee")
@@ -307,17 +319,8 @@ def _draw_errors(axes: "Axes", picture: Picture) -> None:
 def _draw_doppler(axes: "Axes", picture: Picture) -> None:
     assert picture.doppler is not None
     times, speeds, power = picture.doppler
-    loudest = float(np.percentile(power, 99.8))
-    mesh = axes.pcolormesh(
-        times,
-        speeds,
-        power,
-        cmap="magma",
-        vmin=loudest - DYNAMIC_RANGE,
-        vmax=loudest,
-        rasterized=True,
-        shading="nearest",
-    )
+    relative = power - np.percentile(power, 99.8)  # the very loudest lines are few
+    mesh = axes.pcolormesh(times, speeds, relative, cmap="magma", vmin=-DYNAMIC_RANGE, vmax=0, rasterized=True)
     axes.set_ylabel("Doppler, m/s (approaching)")
     axes.figure.colorbar(mesh, ax=axes, label="dB", pad=0.01)
 

@@ -42,6 +42,10 @@ class Recorder(Sink):
         self._carry_truth(until=message.stamp, time=time)
         self._writer.write(key, type(message), payload, stamp=message.stamp, seq=message.seq, log_time=time)
 
+    def note(self, key: str, payload: bytes, time: int) -> None:
+        """Write down what a node left out: a replay will leave it out as well."""
+        self._writer.write_control(key, "caneflow.LeftOut/1", payload, log_time=time)
+
     def idle(self, time: int) -> None:
         """Bring what was written to the disk: a killed recorder loses at most a second."""
         self._writer.flush()

@@ -1,4 +1,4 @@
-"""`caneflow schema`: the JSON Schema of a message, or of everything that travels."""
+"""`caneflow schema`: the JSON Schema of a message, of all that travel, or of a dataflow file."""
 
 import json
 from typing import Annotated, Any
@@ -8,18 +8,22 @@ import typer
 from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, json_schema
 
+DATAFLOW = "dataflow"  # the one schema that is not a message's
+
 
 def command(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="NAME", help="A message, e.g. Imu or caneflow.Imu/1; by default all.", show_default=False
+            metavar="NAME",
+            help="A message, e.g. Imu or caneflow.Imu/1, or dataflow; by default all messages.",
+            show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Print JSON Schemas: of one message, or one object with all of them by name.
+    """Print the JSON Schema of a message, of all messages by name, or of a dataflow file.
 
-    Example: caneflow schema Imu
+    Example: caneflow schema dataflow > dataflow.schema.json
     """
     print(json.dumps(schemas() if name is None else schema_of(name), indent=2))
 
@@ -30,9 +34,13 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def schema_of(name: str) -> dict[str, Any]:
-    """The JSON Schema of the message `name`: `Imu`, or `caneflow.Imu/1`. Raises CaneflowError for another name."""
+    """The JSON Schema of `name`: `Imu`, `caneflow.Imu/1` or `dataflow`. Raises CaneflowError for another name."""
+    if name == DATAFLOW:
+        from caneflow.runtime.yaml_shape import yaml_schema  # here, as a message's schema needs no runtime
+
+        return yaml_schema()
     known = schemas()
     for full_name, schema in known.items():
         if name in (full_name, full_name.removeprefix("caneflow.").partition("/")[0]):
             return schema
-    raise CaneflowError(f"no message {name!r}; there are {', '.join(known)}")
+    raise CaneflowError(f"no schema {name!r}; there are {', '.join((*known, DATAFLOW))}")

@@ -5,15 +5,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
 from caneflow.messages import Imu, Pose, RadarFrame, Sample, numbered, sample_key
-from caneflow.recording import TRUTH, RecordingWriter
+from caneflow.recording import TRUTH, RecordingWriter, require_writable
 from caneflow.simulation.scenario import SCENARIOS, Walk, simulate_walk
 
+FLOW = "cane"
 IMU, RADAR = ("imu", "imu"), ("radar", "frame")
 
 
@@ -25,7 +25,6 @@ def walk(
         float | None,
         typer.Option(metavar="S", min=0.1, help="s; by default until the course has been walked (swing: 53 s)."),
     ] = None,
-    flow: Annotated[str, typer.Option(help="Flow under whose name it is recorded.")] = "cane",
 ) -> None:
     """Simulate a walk with a white cane: IMU and radar at 100 Hz, and where the cane truly was.
 
@@ -35,18 +34,16 @@ def walk(
         raise typer.BadParameter(
             f"no walk {scenario!r}; there are {', '.join(SCENARIOS)}", param_hint="--scenario"
         )
+    require_writable(output)
     with progress_bar(f"{scenario}, seed {seed}") as progress:
         walked = simulate_walk(scenario, seed, duration, progress)
-    with RecordingWriter(output, flow=flow, source="simulated", rig=dict(walked.rig)) as writer:
+    with RecordingWriter(output, flow=FLOW, source="simulated", rig=dict(walked.rig)) as writer:
         for seq, samples in enumerate(samples_of(walked)):
             for name, sample in samples:
                 payload, stamp = numbered(sample, seq), sample.stamp
-                writer.write(sample_key(flow, *name), type(sample), payload, stamp=stamp, seq=seq, log_time=stamp)
-    steps = np.linalg.norm(np.diff(walked.position[:, :2], axis=0), axis=1)
+                writer.write(sample_key(FLOW, *name), type(sample), payload, stamp=stamp, seq=seq, log_time=stamp)
     seconds = float(walked.stamps_ns[-1] - walked.stamps_ns[0]) / 1e9
-    print(
-        f"{output}: {scenario}, seed {seed}: {len(walked.stamps_ns)} samples, {seconds:.2f} s, {steps.sum():.2f} m"
-    )
+    print(f"{output}: {scenario}, seed {seed}: {len(walked.stamps_ns)} samples a stream, {seconds:.2f} s")
 
 
 def samples_of(walked: Walk) -> Iterator[tuple[tuple[tuple[str, str], Sample], ...]]:

@@ -17,6 +17,7 @@ INTERRUPTED_STATUS = 130  # 128 + SIGINT, as a shell reports Ctrl-C
 
 # Word -> module in tools, one line of help. A tool has `command`, a function whose annotations are its options, or
 # `commands`, such functions by word. It is imported when its word is used: `caneflow check` needs no matplotlib.
+# Docstrings are the help, in rich's markup: [this] would vanish from it.
 WORDS: dict[str, tuple[str, str]] = {
     "run": ("run", "Run a flow: live, or from a recording."),
     "check": ("check", "Find every mistake in a dataflow file; start nothing."),
@@ -37,6 +38,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "export": ("export", "Write a stream of a recording for other programs."),
     "emulate": ("emulate", "Play a device from a recording, for a driver to talk to."),
     "eval": ("evaluate", "Compare methods over recordings with ground truth."),
+    "experiments": ("experiments", "Make the paper's experiments on simulated walks."),
     "calibrate": ("calibrate", "Fit the rig to recordings."),
     "plot": ("plot", "Draw a recording's track and speed."),
     "view": ("view", "Show a running flow in the browser."),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 # through a Gaussian beam of 50 deg. tests/test_edges.py works both out.
 EDGE_BEYOND_SPEED = 0.8  # resolution cells
 FLAT = np.float32(1e-30)
+BESIDE = np.arange(3)
 
 
 def superior_edges(
@@ -25,12 +26,11 @@ def superior_edges(
         whether there is anything to see is not decided here.
     """
     falls = magnitudes[:, :-1] - magnitudes[:, 1:]
-    columns = falls.shape[1]
-    steepest = falls[:, 1:-1].argmax(axis=1) + 1  # with a neighbour on either side
-    flat = steepest + np.arange(0, falls.size, columns)
-    before, top, after = falls.take(flat - 1), falls.take(flat), falls.take(flat + 1)
+    steepest = falls[:, 1:-1].argmax(axis=1)  # counted from column 1: with a neighbour on either side
+    left = steepest + np.arange(0, falls.size, falls.shape[1])
+    before, top, after = falls.take(left[:, None] + BESIDE).T
     # FLAT keeps a flat row from dividing by 0; the clip holds where a neighbour at the rim falls still steeper.
-    curvature = np.minimum(before - 2 * top + after, -FLAT)
+    curvature = np.minimum(before + after - 2 * top, -FLAT)
     shift = np.minimum(np.maximum(0.5 * (before - after) / curvature, -0.5), 0.5)
     # The difference between columns i and i + 1 belongs half way between them.
-    return steepest + (0.5 + shift), top
+    return steepest + (1.5 + shift), top

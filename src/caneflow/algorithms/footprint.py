@@ -69,11 +69,11 @@ class RayCaster:
     def cast(self, *, height: float, axis: float) -> Rays:
         """The rays of an antenna at `height` m whose beam points `axis` rad (alpha0) below the horizontal.
 
-        None if the beam misses the ground, or if more than half of its ground lies outside the recorded ranges.
+        None if half of the fan or more leaves the sensible angles, or half of its ground the recorded ranges.
         """
         fan = self._fan
         low, high = max(axis - fan.half_width, fan.shallowest), min(axis + fan.half_width, fan.steepest)
-        if low >= high or height <= 0:
+        if high - low < fan.half_width or height <= 0:
             return NO_RAYS
         near, far = height / math.sin(high), height / math.sin(low)
         first, last = max(near, self._nearest), min(far, self._farthest)

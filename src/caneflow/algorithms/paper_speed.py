@@ -78,6 +78,8 @@ class PaperSpeed:
             steepest=settings.steepest,
         )
         self._weights = hann(settings.window)
+        self._cell = settings.transform / settings.window  # Doppler bins per resolution cell
+        self._beyond = settings.edge_beyond_speed * self._cell if settings.compensate_edge else 0.0  # Doppler bins
         # Slow-time rows to transform; what lies behind the window stays 0.
         self._padded = np.zeros((settings.rays + 2, settings.transform), np.complex64)
         self._window = SlowTimeWindow(length=settings.window, bins=0)
@@ -105,7 +107,7 @@ class PaperSpeed:
             return _nothing(delay)
         power = self._power(rays)
         spectrum = power.sum(axis=0)
-        peak, floor = peak_and_floor(spectrum, settings.transform / settings.window)
+        peak, floor = peak_and_floor(spectrum, self._cell)
         turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
         if turn_rate is not None and is_at_rest(peak, floor, turn_rate, settings.rest):
             return SpeedEstimate(speed=0.0, quality=0.0, rays=settings.rays, valid=True, delay=delay)
@@ -159,27 +161,31 @@ class PaperSpeed:
     ) -> tuple[list[float], list[float]]:
         """Speed over ground (m/s, eq. 2) of the rays that show one, and the heights of their edges.
 
-        A ray shows one if its Doppler stands out of the noise `floor`. None counts if the edges of many come near the
-        limit of unambiguous Doppler: the rest of them would tell of the slow part of the ground only.
+        A ray shows one if its Doppler stands out of the noise `floor`. None counts if the edges of many come near
+        the limit of unambiguous Doppler: the rest of them would tell of the slow part of the ground only.
         """
         settings = self._settings
         half = settings.transform // 2
         approaching = power[:, : half + 1]
         edges, falls = superior_edges(np.sqrt(approaching))
-        shows = approaching.max(axis=1) > settings.least_peak * floor
-        ambiguous = shows & (edges > settings.alias_share * half)
-        if 4 * np.count_nonzero(ambiguous) > settings.rays:
-            return [], []
-        shows &= ~ambiguous
-        if settings.compensate_edge:
-            cell = settings.transform / settings.window  # Doppler bins
-            edges = np.maximum(edges - settings.edge_beyond_speed * cell, 0.0)
-        speeds: list[float] = (edges * per_bin)[shows].tolist()
-        heights: list[float] = falls[shows].tolist()
-        return speeds, heights
+        peaks = approaching.max(axis=1)
+        least_peak, last_edge, beyond = settings.least_peak * floor, settings.alias_share * half, self._beyond
+        speeds, heights, ambiguous = [], [], 0
+        # Plain Python from here on: for a handful of numbers, numpy's calls cost more.
+        for edge, fall, peak, scale in zip(
+            edges.tolist(), falls.tolist(), peaks.tolist(), per_bin.tolist(), strict=True
+        ):
+            if peak <= least_peak:
+                continue
+            if edge > last_edge:
+                ambiguous += 1
+            else:
+                speeds.append(max(edge - beyond, 0.0) * scale)
+                heights.append(fall)
+        return ([], []) if 4 * ambiguous > settings.rays else (speeds, heights)
 
     def _average(self, speeds: list[float], falls: list[float], delay: float) -> SpeedEstimate:
-        """Eq. 3 and 4. In plain Python: for a handful of numbers, numpy's calls cost more."""
+        """Eq. 3 and 4, if enough rays agree."""
         settings = self._settings
         if len(speeds) < settings.fewest_rays:
             return _nothing(delay)

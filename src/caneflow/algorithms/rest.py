@@ -26,7 +26,7 @@ class RestSettings:
     """When the cane counts as being at rest."""
 
     enabled: bool = True
-    # White noise gives 2.4, 3.5 at times; ground at 5 dB that passes at 0.25 m/s gives 14 or more.
+    # White noise gives 2 to 2.5, at times 3.5; ground at 5 dB that passes at 0.25 m/s gives 14 or more.
     largest_peak: Annotated[float, Gt(1)] = 7.0  # of the noise floor
     # A gyro's bias is below 2 deg/s, a still hand turns by 0.5; walking turns the cane by 5 deg/s or more.
     largest_turn_rate: Annotated[float, Gt(0)] = math.radians(5.0)  # rad/s, mean norm over the window

@@ -4,7 +4,7 @@ Aligned at start position and yaw only. A fit over the whole track would hide a 
 """
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,23 +57,26 @@ class Track:
             )
 
 
+class Aligned(NamedTuple):
+    """An estimate laid on the truth."""
+
+    track: Floats  # (n, 2) m, the estimate
+    path: Floats  # (n, 2) m, the truth at the estimate's stamps
+    turn: float  # rad, by which the estimate was turned counter-clockwise
+
+
 def track_errors(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0, 0.0)) -> TrackErrors:
     """Errors of `estimate` against `truth`; `boresight` is the body vector whose yaw is aligned.
 
     Raises ValueError when the estimate misses more than LARGEST_MISS_NS of either end of the truth.
     """
     _require_cover(estimate.stamps, truth.stamps)
-    origin = estimate.stamps[0]
-    times = (estimate.stamps - origin) * 1e-9
-    truth_times = (truth.stamps - origin) * 1e-9
-    yaw = boresight_yaws(estimate.orientations, boresight)
+    track, path, turn = aligned(estimate, truth, boresight=boresight)
+    times = (estimate.stamps - estimate.stamps[0]) * 1e-9
+    truth_times = (truth.stamps - estimate.stamps[0]) * 1e-9
+    yaw = boresight_yaws(estimate.orientations, boresight) + turn
     truth_yaw = boresight_yaws(truth.orientations, boresight)
-
-    turn = _start_turn(estimate.stamps, yaw, truth_yaw)
-    track = _turned((estimate.positions - estimate.positions[0])[:, :2], turn)
-    path = np.stack([np.interp(times, truth_times, truth.positions[:, axis]) for axis in (0, 1)], axis=1)
-    path -= path[0]
-    heading_error = yaw + turn - np.interp(times, truth_times, np.unwrap(truth_yaw))
+    heading_error = yaw - np.interp(times, truth_times, np.unwrap(truth_yaw))
 
     errors = np.linalg.norm(track - path, axis=1)
     length, final = path_length(path), float(errors[-1])
@@ -94,19 +97,24 @@ def track_errors(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0
     )
 
 
+def aligned(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0, 0.0)) -> Aligned:
+    """Both tracks from one origin in the truth's frame: aligned at the start's position and yaw, nothing else."""
+    origin = estimate.stamps[0]
+    yaw = boresight_yaws(estimate.orientations, boresight)
+    turn = _start_turn(estimate.stamps, yaw, boresight_yaws(truth.orientations, boresight))
+    times, truth_times = (estimate.stamps - origin) * 1e-9, (truth.stamps - origin) * 1e-9
+    path = np.stack([np.interp(times, truth_times, truth.positions[:, axis]) for axis in (0, 1)], axis=1)
+    track = _turned((estimate.positions - estimate.positions[0])[:, :2], turn)
+    return Aligned(track, path - path[0], turn)
+
+
 def final_offset(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0, 0.0)) -> Floats:
-    """Where the estimate ends less where the truth ends (m, shape (2,)), both aligned as in `track_errors`.
+    """Where the estimate ends less where the truth ends (m, shape (2,)), both aligned as in `aligned`.
 
     In the estimate's own frame, which is that of its covariance; its length is `final_error`.
     """
-    yaw = boresight_yaws(estimate.orientations, boresight)
-    truth_yaw = boresight_yaws(truth.orientations, boresight)
-    turn = _start_turn(estimate.stamps, yaw, truth_yaw)
-    times = (truth.stamps - estimate.stamps[0]) * 1e-9
-    ends = np.array([0.0, (estimate.stamps[-1] - estimate.stamps[0]) * 1e-9])
-    path = np.stack([np.interp(ends, times, truth.positions[:, axis]) for axis in (0, 1)], axis=1)
-    offset: Floats = (estimate.positions[-1] - estimate.positions[0])[:2] - _turned(path[1:] - path[:1], -turn)[0]
-    return offset
+    track, path, turn = aligned(estimate, truth, boresight=boresight)
+    return _turned(track[-1:] - path[-1:], -turn)[0]
 
 
 def boresight_yaws(orientations: Floats, boresight: Vector) -> Floats:

@@ -24,6 +24,17 @@ class Window(msgspec.Struct, frozen=True, gc=False):
     until: int
 
 
+class LeftOut(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """`@/late`: samples of one input that a live node did not handle, so that a replay leaves them out as well."""
+
+    node: str
+    port: str
+    reason: str  # late, dropped, lost
+    first_seq: int
+    last_seq: int  # the same, but for lost ones
+    stamp: int = -1  # ns; -1: never came, so it is not known
+
+
 class InputCounts(msgspec.Struct, kw_only=True, gc=False):
     """What became of the samples of one input: received is the sum of all the others but lost."""
 
@@ -34,6 +45,7 @@ class InputCounts(msgspec.Struct, kw_only=True, gc=False):
     lost: int = 0  # never came: gaps in seq
     dropped: int = 0  # fell out of a full queue, or were too old (max_age_ms)
     late: int = 0  # came after the graph had gone on without them (max_lag_ms)
+    left_out: int = 0  # replayed, but not handled when the recording was made
     waiting: int = 0
 
 

@@ -1,4 +1,4 @@
-"""The tables of docs/messages.md, written from the message classes: `python -m caneflow.messages.reference docs`."""
+"""The tables of docs/messages.md, written by `python -m caneflow.messages.reference docs`."""
 
 import re
 import sys

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from caneflow.messages.errors import MessageError
 from caneflow.messages.samples import Vector3
@@ -65,6 +65,19 @@ class Rig(BaseModel):
                 f"rig.{name} is not known ({meaning}); write it under rig: in the yaml, or give --rig FILE"
             )
         return value
+
+
+def read_rig(values: dict[str, Any]) -> Rig:
+    """The rig in a map that a recording or a plan holds; raises MessageError, naming every value that is not right.
+
+    Keys that this version does not know are left out: a later one may have recorded them.
+    """
+    known = {key: value for key, value in values.items() if key in Rig.model_fields}
+    try:
+        return Rig.model_validate(known)
+    except ValidationError as error:
+        causes = (f"rig.{'.'.join(map(str, cause['loc']))}: {cause['msg']}" for cause in error.errors())
+        raise MessageError("; ".join(causes)) from error
 
 
 def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from caneflow.recording.errors import RecordingError
 from caneflow.recording.reader import TRUTH, Recorded, Recording, Stream
 from caneflow.recording.recover import Recovered, recover
-from caneflow.recording.writer import Compression, Origin, RecordingWriter
+from caneflow.recording.writer import Compression, Origin, RecordingWriter, require_writable
 
 __all__ = [
     "TRUTH",
@@ -16,4 +16,5 @@ __all__ = [
     "Recovered",
     "Stream",
     "recover",
+    "require_writable",
 ]

@@ -114,6 +114,13 @@ class Recording:
         each = (self._samples_of(stream, start_ns, end_ns) for stream in wanted)
         return heapq.merge(*each, key=attrgetter("stamp"))  # equal stamps: in the order of the arguments
 
+    def said(self, key: str) -> Iterator[bytes]:
+        """The payloads of a control key such as `cane/@/late`, in the order of the file."""
+        for block in self._blocks(key):
+            content = self._content(block)
+            for *_, begin, finish in content.messages[key]:
+                yield content.data[begin:finish]
+
     def stream(self, node: str, port: str) -> Stream:
         """The stream that `node` said on `port`; raises RecordingError, naming those there are."""
         try:

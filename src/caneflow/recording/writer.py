@@ -136,6 +136,18 @@ class RecordingWriter:
             ) from error
 
 
+def require_writable(path: str | Path) -> None:
+    """Raise RecordingError if no recording can be written at `path`: before the work that would fill it."""
+    path = Path(path)
+    was_there = path.exists()
+    try:
+        path.open("ab").close()
+        if not was_there:
+            path.unlink()
+    except OSError as error:
+        raise RecordingError(_cannot_open(path, error)) from error
+
+
 def _cannot_open(path: Path, error: OSError) -> str:
     if isinstance(error, FileNotFoundError):
         return f"{path}: cannot be written, there is no folder {path.parent}"

@@ -14,7 +14,7 @@ import msgspec
 import zenoh
 
 from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, encode
-from caneflow.messages.control import Counters, PortMark, Progress, Window
+from caneflow.messages.control import Counters, LeftOut, PortMark, Progress, Window
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.links import open_session
 from caneflow.runtime.plan import InputPlan, NodePlan
@@ -41,6 +41,13 @@ class Marked(msgspec.Struct, frozen=True, gc=False):
     mark: PortMark
 
 
+class Noted(msgspec.Struct, frozen=True, gc=False):
+    """What a node says that it left out."""
+
+    key: str
+    payload: bytes
+
+
 class Started(msgspec.Struct, frozen=True, gc=False):
     """The launcher's word that every node is ready."""
 
@@ -56,7 +63,7 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
 
 
 Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
-Event: TypeAlias = Arrived | Marked | Started | Opened | Stopped
+Event: TypeAlias = Arrived | Noted | Marked | Started | Opened | Stopped
 
 
 class Bus:
@@ -72,6 +79,7 @@ class Bus:
         self._publishers = {port: self._publisher(out.key, out.schema) for port, out in plan.outputs.items()}
         self._progress = self._control_publisher("progress", plan.node)
         self._counters = self._control_publisher("counters", plan.node)
+        self._late = self._control_publisher("late")
 
     def __enter__(self) -> "Bus":
         return self
@@ -115,6 +123,10 @@ class Bus:
         """Publish how far this node has come."""
         self._progress.put(encode(progress))
 
+    def send_left_out(self, note: LeftOut) -> None:
+        """Publish that a sample was not handled."""
+        self._late.put(encode(note))
+
     def send_counters(self, counters: Counters) -> None:
         """Publish what became of this node's samples."""
         self._counters.put(encode(counters))
@@ -131,6 +143,8 @@ class Bus:
         self._subscribe(control_key(plan.flow, "start"), lambda _: self._inbox.put(Started()))
         if plan.replay:
             self._subscribe(control_key(plan.flow, "window"), self._on_window)
+        if plan.hears_notes:
+            self._subscribe(control_key(plan.flow, "late"), self._on_note)
 
     def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
         # indirect=False: straight on Zenoh's receiving thread, which a put into the inbox does not hold up.
@@ -182,6 +196,9 @@ class Bus:
                     self._inbox.put(Marked(ports[port], mark))
 
         return put
+
+    def _on_note(self, sample: zenoh.Sample) -> None:
+        self._inbox.put(Noted(str(sample.key_expr), sample.payload.to_bytes()))
 
     def _on_window(self, sample: zenoh.Sample) -> None:
         window = _control(sample, Window)

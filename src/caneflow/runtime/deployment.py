@@ -4,17 +4,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 
-from caneflow.messages import Sample, sample_key
-from caneflow.messages.rig import overlaid
+from caneflow.messages import Sample, control_key, decode, sample_key
+from caneflow.messages.control import LeftOut
+from caneflow.messages.rig import overlaid, read_rig
 from caneflow.recording import Recording
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.graph import Graph, Node
 from caneflow.runtime.links import Ports
 from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
+
+LeftOutStamps: TypeAlias = dict[tuple[str, str], set[int]]
 
 RECORDER = "recorder"
 TRUTH = ("truth", "pose")
@@ -63,13 +66,15 @@ def deploy(
         with Recording(replay.recording) as recording:
             origin = _origin(recording, replay)
             base_rig = overlaid(graph.rig, recording.rig)
+            left_out = _left_out(graph, recording)
             plans = {
-                name: _plan(graph, node, nodes)
+                name: _plan(graph, node, nodes, left_out)
                 if node.inputs
                 else _replayed(graph, node, nodes, replay, recording, origin)
                 for name, node in nodes.items()
             }
     whole_rig = overlaid(base_rig, rig or {})
+    read_rig(whole_rig)  # what is wrong with a recording's rig is said before anything starts
     if record is not None:
         plans[RECORDER] = _recorder(graph, plans, record, replay, whole_rig)
     plans = {name: _with_readers(plan, plans, whole_rig, replay is not None) for name, plan in plans.items()}
@@ -88,7 +93,7 @@ def linked(deployment: Deployment, ports: Ports, launcher: str) -> Deployment:
     return Deployment(flow=deployment.flow, plans=plans, origin=deployment.origin)
 
 
-def _plan(graph: Graph, node: Node, nodes: dict[str, Node]) -> NodePlan:
+def _plan(graph: Graph, node: Node, nodes: dict[str, Node], left_out: LeftOutStamps | None = None) -> NodePlan:
     inputs = {
         port: InputPlan(
             key=sample_key(graph.flow, wire.node, wire.port),
@@ -97,6 +102,7 @@ def _plan(graph: Graph, node: Node, nodes: dict[str, Node]) -> NodePlan:
             length=wire.queue.length,
             max_lag_ms=wire.max_lag_ms,
             max_age_ms=wire.max_age_ms,
+            left_out=tuple(sorted((left_out or {}).get((node.name, port), ()))),
         )
         for port, wire in node.inputs.items()
         if wire.node in nodes
@@ -162,6 +168,24 @@ def _replayed(
     )
 
 
+def _left_out(graph: Graph, recording: Recording) -> LeftOutStamps:
+    """What the nodes of a recorded live run said that they did not handle: by node and port, the stamps (ns)."""
+    stamps: LeftOutStamps = {}
+    for payload in recording.said(control_key(recording.flow, "late")):
+        note = decode(payload, LeftOut)
+        reader = graph.nodes.get(note.node)
+        wire = reader.inputs.get(note.port) if reader else None
+        if wire is None:
+            continue  # another graph than the recorded one: what it leaves out is its own affair
+        found = stamps.setdefault((note.node, note.port), set())
+        if note.stamp >= 0:
+            found.add(note.stamp)
+        elif (wire.node, wire.port) in recording.streams:  # never came there, but did come to the recorder
+            lost = range(note.first_seq, note.last_seq + 1)
+            found.update(s.stamp for s in recording.samples([(wire.node, wire.port)]) if s.seq in lost)
+    return stamps
+
+
 def _span(recording: Recording) -> tuple[int, int]:
     span = recording.span()
     if span is None:
@@ -208,7 +232,14 @@ def _recorder(
         "source": "replayed" if replay else "live",
         "truth_from": str(replay.recording.resolve()) if replay and carries_truth else None,
     }
-    return NodePlan(flow=graph.flow, node=RECORDER, module=RECORDER_MODULE, settings=settings, inputs=inputs)
+    return NodePlan(
+        flow=graph.flow,
+        node=RECORDER,
+        module=RECORDER_MODULE,
+        settings=settings,
+        inputs=inputs,
+        hears_notes=replay is None,
+    )
 
 
 def _with_readers(plan: NodePlan, plans: dict[str, NodePlan], rig: dict[str, Any], replay: bool) -> NodePlan:

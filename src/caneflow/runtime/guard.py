@@ -1,8 +1,8 @@
 """Ends the processes of a flow when its launcher dies, however it dies. Standard library only.
 
-The launcher holds the other end of this process's standard input; when it closes, whatever carries a path of the run's
-own folder on its command line, as every node does, is killed with its process group. A launcher that ends in good
-order has ended its nodes before.
+The launcher holds the other end of this process's standard input. When it closes, whatever carries a path of the
+run's own folder on its command line, as every node does, is killed with its process group. A launcher that ends in
+good order has ended its nodes before.
 """
 
 import contextlib

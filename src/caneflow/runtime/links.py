@@ -16,6 +16,20 @@ from caneflow.runtime.errors import DataflowError
 LIVE_LEASE = 1_000  # ms until a frozen peer is given up
 REPLAY_LEASE = 60_000  # ms: a replay waits for a reader that stalls, it does not lose it
 WAIT_BEFORE_CLOSE = 600_000_000  # us that a blocking put waits before the link is closed
+# A burst of 100 small express samples with Zenoh's default queue of 2 batches and 1 ms: 12 % dropped on loopback.
+# With these: none, and no put took longer than 3 ms.
+BATCHES = 16  # that may wait to be sent; Zenoh's greatest
+WAIT_BEFORE_DROP = 20_000  # us that a live put waits before the sample is dropped
+PRIORITIES = (
+    "control",
+    "real_time",
+    "interactive_high",
+    "interactive_low",
+    "data_high",
+    "data",
+    "data_low",
+    "background",
+)
 RETRY = {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2}
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ports, so that no outgoing connection takes one
 
@@ -34,6 +48,10 @@ def open_session(
         "scouting/gossip/enabled": False,
         "open/return_conditions/connect_scouted": False,
         "transport/link/tx/lease": REPLAY_LEASE if replay else LIVE_LEASE,
+        "transport/link/tx/queue/size": {
+            priority: BATCHES if priority == "data" else 2 for priority in PRIORITIES
+        },
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE,
     }
     config = zenoh.Config()

@@ -41,9 +41,9 @@ class Merge:
         """How many samples of `port` wait."""
         return len(self._queues[self._index[port]])
 
-    def drop_oldest(self, port: str) -> None:
-        """Forget the oldest waiting sample of `port`."""
-        self._queues[self._index[port]].popleft()
+    def drop_oldest(self, port: str) -> Sample:
+        """Take the oldest waiting sample of `port` away."""
+        return self._queues[self._index[port]].popleft()
 
     def pop(self) -> tuple[str, Sample] | None:
         """The next sample in event time, or None while another stream may still come before it."""
@@ -57,13 +57,6 @@ class Merge:
         first = self._first()
         holding = None if first is None else self._holding(first)
         return None if holding is None else self.ports[holding]
-
-    def go_on_without(self, port: str) -> None:
-        """Stop waiting for `port` at the next sample: what it still brings before that is late."""
-        first = self._first()
-        if first is not None:
-            i = self._index[port]
-            self._watermarks[i] = max(self._watermarks[i], self._needed(first, i))
 
     def handled(self) -> int:
         """Up to which stamp (ns) everything has come and has been handed on."""

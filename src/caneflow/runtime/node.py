@@ -7,15 +7,17 @@ import logging
 import signal
 import sys
 import time
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from caneflow.errors import CaneflowError
-from caneflow.messages import MessageError, decode, numbered
+from caneflow.messages import MessageError, Sample, decode, numbered
 from caneflow.messages.control import Counters, Progress
-from caneflow.messages.rig import Rig
-from caneflow.runtime.bus import Arrived, Bus, Event, Marked, Opened, Started, Stopped, check_schema
+from caneflow.messages.rig import read_rig
+from caneflow.runtime.bus import Arrived, Bus, Event, Marked, Noted, Opened, Started, Stopped, check_schema
 from caneflow.runtime.feed import Feed
 from caneflow.runtime.merge import BEGIN, END
 from caneflow.runtime.plan import NodePlan
@@ -49,8 +51,8 @@ def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
     settings = validated_settings(program, plan.settings)
     ports = plan.outputs if issubclass(program, Source) else plan.inputs
     kinds = {port: wire.kind for port, wire in ports.items()}
-    rig = Rig.model_validate(plan.rig)
-    return program(settings, Context(node=plan.node, rig=rig, ports=kinds, random=generator(plan.seed, plan.node)))
+    random = generator(plan.seed, plan.node)
+    return program(settings, Context(node=plan.node, rig=read_rig(plan.rig), ports=kinds, random=random))
 
 
 def _run(program: Program, plan: NodePlan) -> int:
@@ -93,7 +95,7 @@ class _Reports:
             self._next_counters = time.monotonic() + COUNTERS_PERIOD
 
 
-class _ReaderNode:
+class _ReaderNode(ABC):
     """What a node with inputs does on a bus, whether operator or sink."""
 
     def __init__(self, plan: NodePlan, bus: Bus, reader: Stage | Tap) -> None:
@@ -118,9 +120,11 @@ class _ReaderNode:
                 self.take_sample(event)
             case Marked():
                 self.reader.mark(event.port, event.mark)
+            case Noted() if isinstance(self.reader, Tap):
+                self.reader.note(event.key, event.payload, time.time_ns())
             case Stopped():
                 self.stopped = True
-            case Started() | Opened():
+            case _:
                 pass  # for sources
 
     def take_sample(self, arrived: Arrived) -> None:
@@ -131,10 +135,11 @@ class _ReaderNode:
         except MessageError as error:
             self.reader.refuse(arrived.port, error)
             return
-        if isinstance(self.reader, Tap):
-            self.reader.offer(arrived.port, message, arrived.payload, time.time_ns())
-        else:
-            self.reader.offer(arrived.port, message)
+        self.take_message(arrived, message)
+
+    @abstractmethod
+    def take_message(self, arrived: Arrived, message: Sample) -> None:
+        """Take a sample that could be decoded."""
 
     def give_up_missing(self) -> None:
         """Take samples as lost that were sent and have not come for long: their mark must not wait for ever."""
@@ -154,7 +159,10 @@ class _OperatorNode(_ReaderNode):
     def __init__(self, plan: NodePlan, bus: Bus, operator: Operator) -> None:
         self.stage = Stage(plan.node, operator, plan.inputs, plan.outputs)
         super().__init__(plan, bus, self.stage)
-        self._held_since: float | None = None
+        # Live: for each input that may lag, when the samples of the others came, and their stamps.
+        self._others: dict[str, deque[tuple[float, int]]] = {
+            port: deque() for port, wire in plan.inputs.items() if wire.max_lag_ms is not None and not plan.replay
+        }
 
     def run(self) -> None:
         self.bus.declare_ready()
@@ -166,10 +174,15 @@ class _OperatorNode(_ReaderNode):
             self.report()
         self.count(self.sent(), at_once=True)
 
+    def take_message(self, arrived: Arrived, message: Sample) -> None:
+        for port, others in self._others.items():
+            if port != arrived.port:
+                others.append((time.monotonic(), message.stamp))
+        self.stage.offer(arrived.port, message)
+
     def handle_what_is_due(self) -> None:
         now = None if self.plan.replay else time.time_ns()
         while (emitted := self.stage.step(now)) is not None:
-            self._held_since = None
             for port, message, seq in emitted:
                 self.bus.send(port, numbered(message, seq))
             if self.reports.due():
@@ -178,20 +191,20 @@ class _OperatorNode(_ReaderNode):
                 self.take_events(timeout=0)
 
     def wait_no_longer_than_allowed(self) -> None:
-        """Live: go on without an input that holds the others up for longer than its max_lag_ms."""
-        port = self.stage.held_by()
-        limit = None if port is None or self.plan.replay else self.plan.inputs[port].max_lag_ms
-        if port is None or limit is None:
-            self._held_since = None
-            return
+        """Live: go on without an input that holds up what came longer than its max_lag_ms ago."""
         now = time.monotonic()
-        if self._held_since is None:
-            self._held_since = now
-        elif (now - self._held_since) * 1e3 > limit:
-            self.stage.go_on_without(port)
-            self.handle_what_is_due()
+        for port, others in self._others.items():
+            limit = self.plan.inputs[port].max_lag_ms or 0.0
+            until = None
+            while others and (now - others[0][0]) * 1e3 > limit:
+                _, until = others.popleft()
+            if until is not None:
+                self.stage.go_on_without(port, until)
+                self.handle_what_is_due()
 
     def report(self) -> None:
+        for note in self.stage.left_out():
+            self.bus.send_left_out(note)
         progress = self.stage.progress()
         if self.stage.finished or self.stage.tells_more_than_samples() or self.reports.due():
             if self.stage.finished:
@@ -224,6 +237,9 @@ class _SinkNode(_ReaderNode):
         finally:
             self.tap.finish()
         self.count({}, at_once=True)
+
+    def take_message(self, arrived: Arrived, message: Sample) -> None:
+        self.tap.offer(arrived.port, message, arrived.payload, time.time_ns())
 
 
 class _Ended(BaseException):

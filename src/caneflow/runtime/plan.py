@@ -19,11 +19,17 @@ class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     length: int | None = None  # how many samples may wait; the oldest is dropped beyond. None: all
     max_lag_ms: float | None = None  # live: how long the graph waits for this input. None: for ever
     max_age_ms: float | None = None  # live: older samples are dropped. None: never
+    left_out: tuple[int, ...] = ()  # stamps (ns) of samples that the recorded live run did not handle
 
     @cached_property
     def kind(self) -> type[Sample]:
         """The type that the port takes."""
         return SAMPLES[self.schema]
+
+    @cached_property
+    def left_out_stamps(self) -> frozenset[int]:
+        """`left_out`, for looking up."""
+        return frozenset(self.left_out)
 
 
 class OutputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
@@ -58,6 +64,7 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
     replay: bool = False  # sources are recordings: nothing may be lost, everybody waits
     inputs: dict[str, InputPlan] = {}
     outputs: dict[str, OutputPlan] = {}
+    hears_notes: bool = False  # a recorder also takes what nodes say they left out
     readers: tuple[str, ...] = ()  # the nodes that read an output, the recorder among them
     links: Links = Links()
     ready_timeout_s: float = 20.0

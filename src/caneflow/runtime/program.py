@@ -109,6 +109,9 @@ class Sink(ABC):
     def take(self, key: str, message: Sample, payload: bytes, time: int) -> None:
         """Take one sample, with its bytes as sent and the time of reception (ns)."""
 
+    def note(self, key: str, payload: bytes, time: int) -> None:  # noqa: B027 - most sinks have no use for it
+        """Take what a node says that it left out (`@/late`), at `time` (ns); only a recorder is told."""
+
     @abstractmethod
     def idle(self, time: int) -> None:
         """Called when nothing has come for a while, with the time (ns)."""

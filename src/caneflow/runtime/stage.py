@@ -7,7 +7,7 @@ emits is numbered. Nothing here knows Zenoh, processes or a clock.
 from collections.abc import Iterator, Mapping
 
 from caneflow.messages import MessageError, Sample
-from caneflow.messages.control import InputCounts, PortMark, Progress
+from caneflow.messages.control import InputCounts, LeftOut, PortMark, Progress
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.merge import END, Merge
 from caneflow.runtime.plan import InputPlan, OutputPlan
@@ -22,7 +22,7 @@ class Stage:
         self, node: str, operator: Operator, inputs: Mapping[str, InputPlan], outputs: Mapping[str, OutputPlan]
     ) -> None:
         self.node = node
-        self.inputs = {port: Arrivals(plan) for port, plan in inputs.items()}
+        self.inputs = {port: Arrivals(node, port, plan) for port, plan in inputs.items()}
         self.outputs = {port: Departures(plan) for port, plan in outputs.items()}
         self.finished = False
         self._operator = operator
@@ -34,8 +34,12 @@ class Stage:
         arrivals.counts.received += 1
         if not arrivals.admit(message):
             return
-        if message.stamp <= self._merge.watermark(port):
+        if message.stamp in arrivals.plan.left_out_stamps:
+            arrivals.counts.left_out += 1
+            self._merge.advance(port, message.stamp)
+        elif message.stamp <= self._merge.watermark(port):
             arrivals.counts.late += 1
+            arrivals.leave_out(message, "late")
         else:
             self._merge.push(port, message)
             self._keep_length(port, arrivals)
@@ -61,9 +65,9 @@ class Stage:
         """Note that nothing more will come on `port`, whatever its writer said."""
         self._merge.advance(port, END)
 
-    def go_on_without(self, port: str) -> None:
-        """Stop waiting for `port` at the sample that waits for it."""
-        self._merge.go_on_without(port)
+    def go_on_without(self, port: str, until: int) -> None:
+        """Wait for `port` no longer up to the stamp `until` (ns): what it still brings there is late."""
+        self._merge.advance(port, until)
 
     def held_by(self) -> str | None:
         """The port that the next sample waits for."""
@@ -80,6 +84,7 @@ class Stage:
             arrivals = self.inputs[port]
             if now is not None and arrivals.too_old(message, now):
                 arrivals.counts.dropped += 1
+                arrivals.leave_out(message, "dropped")
                 return iter(())
             arrivals.counts.handled += 1
             return self._numbered(self._handled(port, message))
@@ -98,6 +103,13 @@ class Stage:
         """Whether a reader cannot see from the samples alone how far this node has come."""
         handled = self._merge.handled()
         return any(out.last_stamp < handled for out in self.outputs.values())
+
+    def left_out(self) -> list[LeftOut]:
+        """What was not handled since this was last asked."""
+        found = [note for arrivals in self.inputs.values() for note in arrivals.left_out]
+        for arrivals in self.inputs.values():
+            arrivals.left_out.clear()
+        return found
 
     def input_counts(self) -> dict[str, InputCounts]:
         """What became of every sample that came, per port."""
@@ -124,7 +136,7 @@ class Stage:
     def _keep_length(self, port: str, arrivals: Arrivals) -> None:
         length = arrivals.plan.length
         while length is not None and self._merge.waiting(port) > length:
-            self._merge.drop_oldest(port)
+            arrivals.leave_out(self._merge.drop_oldest(port), "dropped")
             arrivals.counts.dropped += 1
 
     def _count_mark(self, port: str, arrivals: Arrivals) -> None:

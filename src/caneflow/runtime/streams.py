@@ -4,7 +4,7 @@ import logging
 from dataclasses import dataclass, field
 
 from caneflow.messages import MessageError, Sample
-from caneflow.messages.control import InputCounts, PortMark
+from caneflow.messages.control import InputCounts, LeftOut, PortMark
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.merge import BEGIN
 from caneflow.runtime.plan import InputPlan, OutputPlan
@@ -18,11 +18,14 @@ CAUSES_NAMED = 100  # per stream: a hostile writer must not fill the memory
 class Arrivals:
     """One input stream as it arrives: numbered, in order, each fault counted and named once."""
 
+    node: str
+    port: str
     plan: InputPlan
     counts: InputCounts = field(default_factory=InputCounts)
     expected: int = 0  # seq of the next sample
     last_stamp: int = BEGIN  # ns
     unreadable: int = 0  # refused samples whose seq is not known: they are not lost as well
+    left_out: list[LeftOut] = field(default_factory=list)  # to be told by a live host, which empties it
     mark: PortMark | None = None  # of the writer, waiting for its last sample to arrive
     _named: set[str] = field(default_factory=set)
 
@@ -48,7 +51,7 @@ class Arrivals:
                 self.refuse(f"time goes backwards: {stamps}", "backwards")
                 self.expected = message.seq + 1
             return False
-        self._note_lost(message.seq - self.expected - self.unreadable, f"before seq {message.seq}")
+        self._note_lost(message.seq)
         self.unreadable = 0
         # A smaller seq with a newer stamp is a writer that was restarted and counts anew.
         self.expected = message.seq + 1
@@ -63,13 +66,33 @@ class Arrivals:
     def give_up(self) -> None:
         """Take what the writer's mark still promises as lost, so that it counts."""
         if self.mark is not None:
-            self._note_lost(self.mark.last_seq + 1 - self.expected - self.unreadable, "at the end")
+            self._note_lost(self.mark.last_seq + 1)
             self.expected, self.unreadable = self.mark.last_seq + 1, 0
 
-    def _note_lost(self, count: int, where: str) -> None:
+    def leave_out(self, message: Sample, reason: str) -> None:
+        """Note a sample that came and is not handled."""
+        self.left_out.append(
+            LeftOut(
+                node=self.node,
+                port=self.port,
+                reason=reason,
+                first_seq=message.seq,
+                last_seq=message.seq,
+                stamp=message.stamp,
+            )
+        )
+
+    def _note_lost(self, before: int) -> None:
+        """Count what is missing of the samples with a seq < `before`."""
+        count = before - self.expected - self.unreadable
         if count > 0:
             self.counts.lost += count
-            self._say_once("lost", f"{count} samples lost {where}")
+            self._say_once("lost", f"{count} samples lost before seq {before}")
+            self.left_out.append(
+                LeftOut(
+                    node=self.node, port=self.port, reason="lost", first_seq=self.expected, last_seq=before - 1
+                )
+            )
 
     def _say_once(self, kind: str, text: str) -> None:
         if kind not in self._named and len(self._named) < CAUSES_NAMED:

@@ -15,7 +15,7 @@ class Tap:
 
     def __init__(self, node: str, sink: Sink, inputs: Mapping[str, InputPlan]) -> None:
         self.node = node
-        self.inputs = {port: Arrivals(plan) for port, plan in inputs.items()}
+        self.inputs = {port: Arrivals(node, port, plan) for port, plan in inputs.items()}
         self.finished = False
         self._sink = sink
         self._watermarks = {port: BEGIN for port in inputs}
@@ -48,6 +48,11 @@ class Tap:
     def close(self, port: str) -> None:
         """Note that nothing more will come on `port`."""
         self._advance(port, END)
+
+    def note(self, key: str, payload: bytes, time: int) -> None:
+        """Hand on what a node says that it left out."""
+        if not self.finished:
+            self._sink.note(key, payload, time)
 
     def idle(self, time: int) -> None:
         """Give the sink a moment when nothing comes."""

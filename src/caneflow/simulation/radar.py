@@ -8,13 +8,13 @@ analytic signal along r, approaching is positive Doppler (wire.md).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import Floats
@@ -32,12 +32,10 @@ _FAINT = 0.02  # one-way power gain below which a scatterer is left out: -34 dB 
 
 @dataclass(frozen=True, kw_only=True)
 class RadarSettings:
-    """A P440 as cane.md, row 1, has it."""
+    """A P440 (cane.md, row 1: 3.1 to 4.8 GHz)."""
 
     carrier: Annotated[float, Gt(0)] = 4.3e9  # Hz
-    bandwidth: Annotated[float, Gt(0)] = (
-        1.7e9  # Hz, between the -10 dB points: 3.1 to 4.8 GHz and the mask's edges
-    )
+    bandwidth: Annotated[float, Gt(0)] = 1.7e9  # Hz, between the -10 dB points
     range_start: Annotated[float, Gt(0)] = 0.3  # m of bin 0, chosen: just before the floor's first echo
     bins: Annotated[int, Gt(0)] = 288  # three of the P440's quanta of 96 samples, up to 2.9 m
     # mean power of the floor's echo at its strongest range, with the cane held at its nominal attitude, over the
@@ -149,10 +147,9 @@ def floor_power(rig: Rig, pitch: float, reflectivity: float, settings: RadarSett
 
     The integral of reflectivity G^2 / R^4 |p|^2 / 2 over the floor, by a sum over rings and sectors.
     """
-    attitude_now = attitude.from_angles(np.zeros(1), np.array([pitch]), np.zeros(1))
-    boresight = attitude.rotate(attitude_now, BORESIGHT)[0]
-    from_hand = attitude.rotate(attitude_now, np.subtract(rig.antenna, rig.pivot))[0]
-    height = rig.hand_height + from_hand[2]
+    held = attitude.from_angles(np.zeros(1), np.array([pitch]), np.zeros(1))
+    boresight = attitude.rotate(held, BORESIGHT)[0]
+    height = rig.hand_height + attitude.rotate(held, np.subtract(rig.antenna, rig.pivot))[0, 2]
     cells = _cells(settings)
     spacing = 0.01  # m, rad
     radius = spacing * (np.arange(round(cells[-1] / spacing)) + 0.5)[:, None]
@@ -164,8 +161,7 @@ def floor_power(rig: Rig, pitch: float, reflectivity: float, settings: RadarSett
     density = pattern(np.arccos(np.clip(cosine, -1.0, 1.0)), rig.aperture) ** 2 / distance**4 * area
     edges = np.append(cells, cells[-1] + RANGE_STEP / _FINER) - 0.5 * RANGE_STEP / _FINER
     per_cell = np.histogram(distance.ravel(), edges, weights=density.sum(axis=1))[0]
-    power: Floats = 0.5 * reflectivity * per_cell @ _envelope(settings) ** 2
-    return power
+    return 0.5 * reflectivity * _spread(per_cell, 2, settings)
 
 
 def _standing(rig: Rig, pitch: float, floor: float, settings: RadarSettings, rng: Generator) -> Complexes:
@@ -196,26 +192,28 @@ def _seen(
     """The scatterers that may be within range and beam during a block that begins here."""
     offset = scene.points - antenna
     distance = np.linalg.norm(offset, axis=1)
-    # within a block, 0.16 s, a cane moves less than 0.3 m and turns less than 0.3 rad
-    widest = rig.aperture * np.sqrt(-np.log(_FAINT) / (4.0 * np.log(2.0))) + 0.3
+    # within a block, 0.16 s, a cane moves less than 0.3 m and turns less than 0.4 rad, even at 1 m/s
+    widest = rig.aperture * np.sqrt(-np.log(_FAINT) / (4.0 * np.log(2.0))) + 0.4
     kept = (distance < _cells(settings)[-1] + 0.3) & (offset @ boresight > distance * np.cos(widest))
     return scene.points[kept], scene.amplitudes[kept]
 
 
 def _pulsed(summed: Floats, settings: RadarSettings) -> Complexes:
     """Analytic signals (..., bins) of what is in each cell, (2, ..., cells): its real and its imaginary part."""
-    real, imaginary = summed @ _envelope(settings)
+    real, imaginary = _spread(summed, 1, settings)
     carried: Complexes = (real + 1j * imaginary) * np.exp(1j * _wave_number(settings) * settings.ranges())
     return carried
 
 
-@cache
-def _envelope(settings: RadarSettings) -> Floats:
-    """Envelope of the pulse at each bin (columns) for an echo in each cell (rows)."""
-    offset = settings.ranges() - _cells(settings)[:, None]
-    envelope: Floats = np.exp(-0.5 * (offset / pulse_length(settings)) ** 2)
-    envelope.flags.writeable = False
-    return envelope
+def _spread(per_cell: Floats, exponent: int, settings: RadarSettings) -> Floats:
+    """What is in each cell (..., cells) under the envelope of a pulse, to the power `exponent`, (..., bins)."""
+    spacing = RANGE_STEP / _FINER
+    half = round(4.5 * pulse_length(settings) / spacing)
+    offset = spacing * np.arange(-half, half + 1)
+    envelope = np.exp(-0.5 * exponent * (offset / pulse_length(settings)) ** 2)
+    spread: Floats = convolve1d(per_cell, envelope, axis=-1, mode="constant")
+    first = _FINER * _beyond(settings)
+    return spread[..., first : first + _FINER * settings.bins : _FINER]
 
 
 def pulse_length(settings: RadarSettings) -> float:
@@ -226,10 +224,15 @@ def pulse_length(settings: RadarSettings) -> float:
 
 def _cells(settings: RadarSettings) -> Floats:
     """Ranges (m) on which echoes are added up: finer than the bins, and a pulse more at each end."""
-    beyond = round(4.0 * pulse_length(settings) / RANGE_STEP)
+    beyond = _beyond(settings)
     count = _FINER * (settings.bins + 2 * beyond)
     cells: Floats = settings.range_start + RANGE_STEP * (np.arange(count) / _FINER - beyond)
     return cells
+
+
+def _beyond(settings: RadarSettings) -> int:
+    """Bins by which the cells reach beyond the scan at each end."""
+    return round(4.0 * pulse_length(settings) / RANGE_STEP)
 
 
 def _wave_number(settings: RadarSettings) -> float:

@@ -86,7 +86,7 @@ class MotionSettings:
     hand_height_error: NotNegative = 0.01  # m, sd of the person's hand about the rig's nominal height, chosen
     swing: NotNegative = 20.0 * DEGREE  # rad, amplitude (cane.md: about +-20 deg)
     swing_variation: NotNegative = 0.08  # of the swing, sd, chosen
-    swing_until: float | None = None  # fraction of the course after which the cane is held still
+    swing_until: NotNegative | None = None  # fraction of the course after which the cane is held still
     pitch: Positive = 42.0 * DEGREE  # rad (cane.md: about 42 deg)
     pitch_spread: NotNegative = 2.0 * DEGREE  # rad, sd between walks, chosen
     tip_lift: NotNegative = 0.03  # m, the tip clears the ground in the middle of its arc, chosen
@@ -165,9 +165,8 @@ def walk(settings: MotionSettings, rig: Rig, rng: Generator, duration: float | N
     time = (np.arange(round(max(duration, ends) * RATE) + 3) - 1) / RATE
     distance = _distance(pace, legs, time)
     steps = _steps(distance, legs, time, settings, rng)
-    swing_ends = np.inf
-    if settings.swing_until is not None:
-        swing_ends = steps[np.searchsorted(distance, settings.swing_until * track.length)]
+    until = np.inf if settings.swing_until is None else settings.swing_until * track.length
+    swing_ends = np.min(steps[distance >= until], initial=np.inf)
     n = round(duration * RATE) + 3
     time, distance, steps = time[:n], distance[:n], steps[:n]
     heading = track.heading(distance)

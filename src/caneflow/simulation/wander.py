@@ -25,6 +25,8 @@ class Wander:
     def __call__(self, argument: Floats) -> Floats:
         """Values at `argument`, shape (n,) to (n,)."""
         total: Floats = np.zeros_like(argument)
+        if self.deviation == 0.0:
+            return total
         for frequency, phase in zip(self.frequencies, self.phases, strict=True):
             total += np.cos(frequency * argument + phase)
         total *= self.deviation * np.sqrt(2.0 / TERMS)

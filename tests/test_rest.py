@@ -1,0 +1,71 @@
+"""The rest gate: what noise gives, what motion gives, and that neither depends on the noise's strength."""
+
+import math
+
+import numpy as np
+import pytest
+
+from caneflow.algorithms.range_doppler import hann, range_doppler_map
+from caneflow.algorithms.rest import RestSettings, is_at_rest, peak_and_floor
+
+SETTINGS = RestSettings()
+STILL = 0.01  # rad/s
+
+
+def spectrum(scans: np.ndarray) -> np.ndarray:
+    """As the front end makes it: slow-time power in sum over the range rows; `scans` is (rows, 64)."""
+    return np.asarray((np.abs(range_doppler_map(scans, hann(64), 256)) ** 2).sum(axis=0))
+
+
+def noise(rng: np.random.Generator, sd: float = 1.0) -> np.ndarray:
+    return np.asarray(sd * (rng.normal(size=(18, 64)) + 1j * rng.normal(size=(18, 64))))
+
+
+def ground(rng: np.random.Generator, speed: float, snr_db: float) -> np.ndarray:
+    """Lines of random strength below `speed` (m/s, radial), in unit noise."""
+    lines = speed * np.cos(rng.uniform(-0.6, 0.6, 40))
+    phases = 4 * math.pi * 4.3e9 / 299_792_458 * lines[:, None] * np.arange(64) * 0.01
+    weights = rng.normal(size=(18, 40)) + 1j * rng.normal(size=(18, 40))
+    echoes = weights @ np.exp(1j * phases)
+    return np.asarray(echoes / np.abs(echoes).std() * 10 ** (snr_db / 20) + noise(rng))
+
+
+@pytest.mark.parametrize("sd", [1e-2, 1.0, 1e4])
+def test_noise_of_any_strength_is_rest(sd: float) -> None:
+    rng = np.random.default_rng(11)
+    ratios = []
+    for _ in range(300):
+        peak, floor = peak_and_floor(spectrum(noise(rng, sd)), 4)
+        ratios.append(peak / floor)
+        assert is_at_rest(peak, floor, STILL, SETTINGS)
+    assert np.median(ratios) == pytest.approx(2.0, abs=0.2), "the number in the settings' comment"
+    assert max(ratios) < 0.75 * SETTINGS.largest_peak
+
+
+@pytest.mark.parametrize("snr_db", [0, 5, 15])
+@pytest.mark.parametrize("speed", [0.2, 0.5, 1.2])
+def test_ground_that_moves_is_no_rest_even_at_0_db(speed: float, snr_db: float) -> None:
+    rng = np.random.default_rng(12)
+    for _ in range(50):
+        peak, floor = peak_and_floor(spectrum(ground(rng, speed, snr_db)), 4)
+        assert not is_at_rest(peak, floor, STILL, SETTINGS)
+
+
+def test_a_floor_is_found_under_ground_that_fills_half_the_axis() -> None:
+    rng = np.random.default_rng(13)
+    floors = [peak_and_floor(spectrum(ground(rng, 1.7, 20)), 4)[1] for _ in range(20)]
+    quiet = [peak_and_floor(spectrum(noise(rng)), 4)[1] for _ in range(20)]
+    assert np.median(floors) < 2 * np.median(quiet)
+
+
+def test_what_stands_or_drifts_by_less_than_a_cell_is_rest() -> None:
+    rng = np.random.default_rng(14)
+    for drift in (0.0, 0.02):  # m/s; a cell is 0.054
+        peak, floor = peak_and_floor(spectrum(ground(rng, drift, 15)), 4)
+        assert is_at_rest(peak, floor, STILL, SETTINGS)
+
+
+def test_turning_is_no_rest_and_the_gate_can_be_left_open() -> None:
+    assert is_at_rest(2.0, 1.0, math.radians(2), SETTINGS), "a gyro's bias"
+    assert not is_at_rest(2.0, 1.0, math.radians(8), SETTINGS)
+    assert not is_at_rest(2.0, 1.0, STILL, RestSettings(enabled=False))

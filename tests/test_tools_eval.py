@@ -1,0 +1,232 @@
+"""`caneflow eval` on two short simulated walks: its figures are those of what `run` records of them."""
+
+import csv
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from caneflow.algorithms.error_summary import consistent_mean
+from caneflow.messages import Pose
+from caneflow.recording import TRUTH, Recording, RecordingWriter
+from caneflow.runtime.dataflow import load
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.evaluation import FIGURES, chosen_methods, estimates, evaluated, offered_methods
+from caneflow.runtime.program import Emitted, Operator
+from tools import evaluate, simulate
+
+ROOT = Path(__file__).parents[1]
+CHECKS = ROOT.parent / "shared" / "checks"
+FLOW = ROOT / "dataflow.yaml"
+METHODS = offered_methods(load(FLOW))
+
+
+def caneflow(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "caneflow.command", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def walks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("walks")
+    paths = [folder / "swing_1.mcap", folder / "stops_2.mcap"]
+    for seed, path in enumerate(paths, start=1):
+        simulate.walk(output=path, scenario=path.stem.partition("_")[0], seed=seed, duration=6.0)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def answer(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """What `--json` prints of both, and the file that `--csv` writes."""
+    table = tmp_path_factory.mktemp("table") / "eval.csv"
+    done = caneflow("eval", *walks, "--json", "--csv", table)
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout), table
+
+
+def copied(path: Path, to: Path, *, truth: bool, rig: dict[str, Any] | None = None) -> Path:
+    """The recording again, with or without its truth, and with another rig."""
+    with (
+        Recording(path) as source,
+        RecordingWriter(
+            to, flow=source.flow, source="simulated", rig=source.rig if rig is None else rig
+        ) as writer,
+    ):
+        streams = [name for name in source.streams if truth or name != TRUTH]
+        for s in source.samples(streams):
+            assert s.kind is not None
+            writer.write(s.key, s.kind, s.payload, stamp=s.stamp, seq=s.seq, log_time=s.log_time)
+    return to
+
+
+def score() -> ModuleType:
+    """The outside check's own formula."""
+    if not (CHECKS / "score.py").exists():
+        pytest.skip("the outside checks are not here")
+    sys.path.insert(0, str(CHECKS))
+    try:
+        spec = importlib.util.spec_from_file_location("score", CHECKS / "score.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+    finally:
+        sys.path.remove(str(CHECKS))
+
+
+def test_every_method_that_fusion_offers_is_there_with_every_recording_and_figure(
+    answer: tuple[dict[str, Any], Path], walks: list[Path]
+) -> None:
+    by_method, _ = answer
+    assert tuple(by_method) == METHODS
+    assert {"luenberger", "kalman", "shs", "naive_ins"} <= set(by_method)
+    for by_recording in by_method.values():
+        assert list(by_recording) == list(map(str, walks))
+        assert all(tuple(figures) == FIGURES for figures in by_recording.values())
+
+
+@pytest.mark.parametrize("method", ["kalman", "naive_ins"])
+def test_the_figures_are_those_of_the_recording_that_run_makes(
+    answer: tuple[dict[str, Any], Path], walks: list[Path], tmp_path: Path, method: str
+) -> None:
+    output = tmp_path / "out.mcap"
+    done = caneflow(
+        "run", FLOW, "--replay", walks[0], "--in-process", "--set", f"fusion.method={method}", "--record", output
+    )
+    assert done.returncode == 0, done.stderr
+    expected = score().score("walk", walks[0], output)
+    figures = answer[0][method][str(walks[0])]
+    for name, value in expected.items():
+        assert figures[name] == pytest.approx(value, abs=0.51e-2 if name == "drift_percent" else 0.51e-3), name
+
+
+def test_methods_that_run_side_by_side_give_what_each_gives_alone(walks: list[Path]) -> None:
+    graph = load(FLOW)
+    together, _ = estimates(graph, walks[0], METHODS)
+    for method in METHODS:
+        alone, _ = estimates(graph, walks[0], [method])
+        assert (alone[method].track.positions == together[method].track.positions).all(), method
+
+
+def test_several_processes_give_what_one_gives(walks: list[Path]) -> None:
+    one = list(evaluated(FLOW, walks, ["kalman"]))
+    two = list(evaluated(FLOW, walks, ["kalman"], jobs=2))
+    assert [each.recording for each in two] == walks
+    assert [each.figures for each in two] == [each.figures for each in one]
+
+
+def test_the_csv_holds_what_the_json_holds(answer: tuple[dict[str, Any], Path]) -> None:
+    by_method, table = answer
+    with table.open(newline="") as text:
+        rows = list(csv.DictReader(text))
+    read: dict[str, Any] = {}
+    for row in rows:
+        figures = {name: float(row[name]) if row[name] else None for name in FIGURES}
+        read.setdefault(row["method"], {})[row["recording"]] = figures
+    assert read == by_method
+
+
+def test_a_bad_recording_does_not_stop_the_others(walks: list[Path], tmp_path: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_text("this is no recording\n")
+    missing = tmp_path / "missing.mcap"
+    done = caneflow("eval", bad, walks[0], missing, "--methods", "luenberger", "--json")
+    assert done.returncode == 1
+    assert list(json.loads(done.stdout)["luenberger"]) == [str(walks[0])]
+    said = done.stderr.splitlines()
+    assert len(said) == 2
+    assert f"{bad}: is no MCAP file" in said[0]
+    assert f"{missing}: cannot be read" in said[1]
+
+
+def test_without_truth_only_the_papers_figure_is_known(
+    answer: tuple[dict[str, Any], Path], walks: list[Path], tmp_path: Path
+) -> None:
+    blind = copied(walks[0], tmp_path / "blind.mcap", truth=False)
+    (result,) = evaluated(FLOW, [blind], ["luenberger"])
+    figures, with_truth = result.figures["luenberger"], answer[0]["luenberger"][str(walks[0])]
+    for name in ("final_distance", "growth_rate", "duration", "poses"):
+        assert figures[name] == pytest.approx(with_truth[name]), name
+    for name in ("final_error", "ate", "rpe", "drift_percent", "path_length_ratio", "extent", "nees"):
+        assert figures[name] is None, name
+    text = "\n".join(evaluate.lines({"luenberger": {str(blind): figures}}))
+    assert "blind" in text
+
+
+def test_a_method_that_fails_does_not_stop_the_others(walks: list[Path], tmp_path: Path) -> None:
+    """Step-and-heading needs the step length, which this rig leaves open."""
+    with Recording(walks[0]) as source:
+        rig = source.rig | {"step_length": None}
+    poor = copied(walks[0], tmp_path / "poor.mcap", truth=True, rig=rig)
+    (result,) = evaluated(FLOW, [poor], ["shs", "luenberger"])
+    assert list(result.figures) == ["luenberger"]
+    assert list(result.failures) == ["shs"]
+    assert "step_length is not known" in result.failures["shs"]
+    (line,) = evaluate.failed(result)
+    assert line.startswith(f"{poor}: shs: rig.step_length")
+
+
+def test_an_operator_that_breaks_fails_its_recording_only(
+    walks: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fusion = load(FLOW).nodes["fusion"].program
+    assert fusion is not None
+    assert issubclass(fusion, Operator)
+
+    def broken(self: Operator, port: str, message: object) -> Emitted:
+        raise ZeroDivisionError("nobody thought of this")
+
+    monkeypatch.setattr(fusion, "handle", broken)
+    (result,) = evaluated(FLOW, walks[:1], ["luenberger"])
+    assert result.failures["luenberger"].startswith("ZeroDivisionError: nobody thought of this (line ")
+
+
+def test_a_method_that_is_not_offered_is_named_in_one_line(walks: list[Path]) -> None:
+    done = caneflow("eval", walks[0], "--methods", "luenberger,kalmann")
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        f"caneflow eval: no method 'kalmann'; did you mean 'kalman'? fusion offers {', '.join(METHODS)}"
+    ]
+
+
+def test_a_flow_without_an_estimator_is_an_error(tmp_path: Path) -> None:
+    flow = tmp_path / "flow.yaml"
+    flow.write_text("flow: cane\nnodes: {imu: {run: drivers.bno055, settings: {port: /dev/null}}}\n")
+    with pytest.raises(DataflowError, match="no node 'fusion'; there are imu"):
+        chosen_methods(load(flow))
+
+
+def test_the_table_has_a_row_for_every_walk_and_the_papers_figures_beside_ours(
+    answer: tuple[dict[str, Any], Path],
+) -> None:
+    text = "\n".join(evaluate.lines(answer[0]))
+    assert text.count("swing_1") == text.count("stops_2") == 1
+    luenberger = next(line for line in text.splitlines() if line.startswith("luenberger  here"))
+    figures = list(answer[0]["luenberger"].values())
+    mean = sum(each["final_distance"] for each in figures) / 2
+    duration = sum(each["duration"] for each in figures) / 2
+    assert luenberger.split()[2] == "2"
+    assert float(luenberger.split()[5]) == pytest.approx(mean, abs=0.0051)
+    assert float(luenberger.split()[6]) == pytest.approx(mean / duration, abs=0.00051)
+    assert ["paper", "10", "2.7", "0.5", "1.3", "0.026"] in [line.split() for line in text.splitlines()]
+    low, high = consistent_mean(2)
+    assert f"{low:.2f} .. {high:.2f}" in text
+
+
+def test_a_kalman_pose_has_a_covariance_and_so_a_nees(answer: tuple[dict[str, Any], Path]) -> None:
+    by_method, _ = answer
+    assert all(figures["nees"] > 0 for figures in by_method["kalman"].values())
+    assert all(figures["nees"] is None for figures in by_method["naive_ins"].values())
+
+
+def test_the_poses_are_not_recorded(walks: list[Path]) -> None:
+    """The folder of the recordings holds what it held, and they hold no pose but the truth."""
+    assert sorted(path.name for path in walks[0].parent.iterdir()) == ["stops_2.mcap", "swing_1.mcap"]
+    with Recording(walks[0]) as recording:
+        assert recording.streams_of(Pose) == []

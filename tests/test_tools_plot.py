@@ -1,0 +1,166 @@
+"""`caneflow plot`: a picture of whatever there is; the errors it prints are those of the evaluation."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caneflow import command
+from caneflow.algorithms.track_errors import track_errors
+from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
+from caneflow.recording import RecordingWriter
+from tools.plot import read_picture, summary
+
+Run = tuple[int, str, str]  # exit status, standard output, standard error
+PERIOD = 10_000_000  # ns
+YAW = 0.4  # rad that the estimate's world is turned against the truth's
+
+
+@pytest.fixture
+def caneflow(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Run]:
+    """The command, run in this process."""
+
+    def run(*arguments: object) -> Run:
+        monkeypatch.setattr(sys, "argv", ["caneflow", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            command.main()
+        said = capsys.readouterr()
+        return int(end.value.code or 0), said.out, said.err
+
+    return run
+
+
+def write(path: Path, samples: list[tuple[str, Sample]], rig: dict[str, object] | None = None) -> Path:
+    with RecordingWriter(path, flow="cane", source="replayed", rig=rig or {}) as recording:
+        seqs: dict[str, int] = {}
+        for key, sample in samples:
+            seq = seqs[key] = seqs.get(key, -1) + 1
+            payload, stamp = numbered(sample, seq), sample.stamp
+            recording.write(key, type(sample), payload, stamp=stamp, seq=seq, log_time=stamp)
+    return path
+
+
+def pose(stamp: int, x: float, y: float, yaw: float, method: str) -> Pose:
+    return Pose(
+        stamp=stamp,
+        position=(x, y, 0),
+        velocity=(0.5, 0, 0),
+        orientation=(float(np.cos(yaw / 2)), 0, 0, float(np.sin(yaw / 2))),
+        method=method,
+    )
+
+
+def walk(seconds: float, error_at_the_end: float, first: int = 0) -> list[tuple[str, Sample]]:
+    """Straight on at 0.5 m/s, and from sample `first` on an estimate, in a turned world, that goes astray."""
+    count = round(seconds * 100)
+    samples: list[tuple[str, Sample]] = []
+    for i in range(count):
+        stamp, x = PERIOD * i, 0.005 * i
+        samples.append(("cane/truth/pose", pose(stamp, 3 + x, 1, 0, "truth")))
+        if i >= first:
+            along, aside = x - 0.005 * first, error_at_the_end * i / (count - 1)
+            turned = (np.cos(YAW) * along - np.sin(YAW) * aside, np.sin(YAW) * along + np.cos(YAW) * aside)
+            samples.append(("cane/fusion/pose", pose(stamp, float(turned[0]), float(turned[1]), YAW, "kalman")))
+    return samples
+
+
+def radar(count: int, radial_speed: float) -> list[tuple[str, Sample]]:
+    """One scatterer that comes nearer: its phase turns by 4 pi v T / wavelength from scan to scan."""
+    wavelength = 299_792_458 / 4.3e9
+    step = 4 * np.pi * radial_speed * 0.01 / wavelength
+    return [
+        (
+            "cane/radar/frame",
+            RadarFrame(
+                stamp=PERIOD * i,
+                scans=np.array([[1e-3, np.exp(1j * step * i)]], np.complex64),
+                scan_period=0.01,
+                range_start=0.3,
+                range_step=0.009,
+                carrier=4.3e9,
+                bandwidth=1.7e9,
+            ),
+        )
+        for i in range(count)
+    ]
+
+
+def speeds(count: int) -> list[tuple[str, Sample]]:
+    return [
+        (
+            "cane/ground_speed/speed",
+            GroundSpeed(
+                stamp=PERIOD * i, speed=0.5, quality=0.05 if i else float("inf"), rays=9, valid=i > 5, delay=0.3
+            ),
+        )
+        for i in range(count)
+    ]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
+def test_a_track_with_everything_is_drawn(caneflow: Callable[..., Run], tmp_path: Path, suffix: str) -> None:
+    path = write(tmp_path / "track.mcap", [*walk(3, 0.2), *speeds(300), *radar(300, 0.4)])
+    picture = tmp_path / f"track{suffix}"
+    status, out, err = caneflow("plot", path, "-o", picture)
+    assert (status, err) == (0, "")
+    assert (
+        out == "fusion/pose kalman: final error 0.20 m, ATE 0.12 m, end to start 1.51 m, drift 13.4 % of 1.5 m\n"
+    )
+    assert picture.stat().st_size > 10_000
+
+
+def test_errors_are_those_of_the_evaluation(tmp_path: Path) -> None:
+    picture = read_picture(write(tmp_path / "track.mcap", walk(3, 0.2)))
+    track, truth = picture.tracks["fusion/pose kalman"], picture.truth
+    assert truth is not None
+    expected = track_errors(track, truth)
+    errors = picture.errors(track)
+    assert errors[-1] == pytest.approx(expected.final_error) == pytest.approx(0.2)
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(expected.ate)
+
+
+def test_a_run_over_a_part_of_the_walk_is_compared_with_that_part(tmp_path: Path) -> None:
+    picture = read_picture(write(tmp_path / "track.mcap", walk(4, 0.0, first=200)))
+    assert list(summary(picture)) == ["fusion/pose kalman: error 0.00 m after 2.0 s of the walk"]
+
+
+def test_doppler_shows_what_approaches_above_zero(tmp_path: Path) -> None:
+    picture = read_picture(write(tmp_path / "track.mcap", [*walk(3, 0.2), *radar(300, 0.4)]))
+    assert picture.doppler is not None
+    times, radial_speeds, power = picture.doppler
+    assert power.shape == (len(radial_speeds), len(times))
+    assert radial_speeds[power.argmax(axis=0)] == pytest.approx(0.4, abs=radial_speeds[1] - radial_speeds[0])
+
+
+def test_in_a_room_positions_are_absolute(tmp_path: Path) -> None:
+    rig: dict[str, object] = {"sensors": {"south": {"position": [4.1, -2.8, 1.2], "azimuth": 1.5}}}
+    samples = [("room/truth/pose", pose(PERIOD * i, 1, 2, 0, "truth")) for i in range(100)]
+    samples += [("room/room_tracker/pose", pose(PERIOD * i, 1, 2.5, 0, "particles")) for i in range(100)]
+    picture = read_picture(write(tmp_path / "room.mcap", list(samples), rig))
+    assert picture.sensors == {"south": (4.1, -2.8)}
+    assert list(summary(picture)) == [
+        "room_tracker/pose particles: error mean 0.50 m, max 0.50 m, final 0.50 m",
+    ]
+
+
+@pytest.mark.parametrize("kept", ["truth", "fusion"])
+def test_truth_alone_and_a_track_alone_are_drawn(caneflow: Callable[..., Run], tmp_path: Path, kept: str) -> None:
+    path = write(tmp_path / "walk.mcap", [each for each in walk(1, 0.1) if kept in each[0]])
+    status, out, _ = caneflow("plot", path, "-o", tmp_path / "walk.png")
+    assert status == 0
+    assert out == ("" if kept == "truth" else "fusion/pose kalman: 100 poses; no ground truth to compare with\n")
+
+
+def test_a_recording_without_poses_says_so(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    path = write(tmp_path / "walk.mcap", [("cane/imu/imu", Imu(stamp=i, gyro=(0, 0, 0))) for i in range(10)])
+    status, _, err = caneflow("plot", path, "-o", tmp_path / "walk.png")
+    assert status == 2
+    assert err.startswith(f"caneflow plot: {path}: no track to draw, there are no poses in it; `caneflow run")
+    assert err.count("\n") == 1
+
+
+def test_another_kind_of_picture_is_refused_before_the_work(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    said = caneflow("plot", tmp_path / "walk.mcap", "-o", tmp_path / "walk.gif")
+    assert said == (2, "", f"caneflow plot: {tmp_path / 'walk.gif'}: a picture is one of .png, .svg, .pdf\n")
