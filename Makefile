@@ -19,6 +19,7 @@ $(WALK): | $(BIN)/.installed
 run: $(BIN)/.installed $(WALK)
 	$(BIN)/caneflow run dataflow.yaml --replay $(WALK) --speed max --record build/track.mcap
 	$(BIN)/caneflow plot build/track.mcap --output build/track.png
+	@echo "the paper's mean final error over ten walks: 1.3 m; the picture: build/track.png"
 
 test: $(BIN)/.installed
 	$(BIN)/pytest

@@ -140,7 +140,19 @@ def test_what_the_flow_says_of_itself_is_no_stream(tmp_path: Path) -> None:
     with Recording(tmp_path / "run.mcap") as read:
         assert list(read.streams) == [("imu", "imu")]
         assert read.control == {"cane/@/progress/fusion": 1}
+        assert list(read.said("cane/@/progress/fusion")) == [b"\x80"]
         assert [sample.stamp for sample in read.samples()] == [7]
+
+
+def test_the_example_of_the_docs_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    example = page.partition("```python\n")[2].partition("```")[0]
+    write(tmp_path / "walk.mcap", walk(2))
+    monkeypatch.chdir(tmp_path)
+    exec(example, {})  # noqa: S102  # the docs are ours
+    assert len(capsys.readouterr().out.splitlines()) == 5
 
 
 def test_order_comes_from_the_stamps_not_from_the_arrival(tmp_path: Path) -> None:

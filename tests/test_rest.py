@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caneflow.algorithms.range_doppler import hann, range_doppler_map
-from caneflow.algorithms.rest import RestSettings, is_at_rest, peak_and_floor
+from caneflow.algorithms.rest import RestSettings, is_at_rest, peaks_and_floor
 
 SETTINGS = RestSettings()
 STILL = 0.01  # rad/s
@@ -15,6 +15,11 @@ STILL = 0.01  # rad/s
 def spectrum(scans: np.ndarray) -> np.ndarray:
     """As the front end makes it: slow-time power in sum over the range rows; `scans` is (rows, 64)."""
     return np.asarray((np.abs(range_doppler_map(scans, hann(64), 256)) ** 2).sum(axis=0))
+
+
+def peak_and_floor(scans: np.ndarray) -> tuple[float, float]:
+    approaching, receding, floor = peaks_and_floor(spectrum(scans), 4)
+    return max(approaching, receding), floor
 
 
 def noise(rng: np.random.Generator, sd: float = 1.0) -> np.ndarray:
@@ -35,7 +40,7 @@ def test_noise_of_any_strength_is_rest(sd: float) -> None:
     rng = np.random.default_rng(11)
     ratios = []
     for _ in range(300):
-        peak, floor = peak_and_floor(spectrum(noise(rng, sd)), 4)
+        peak, floor = peak_and_floor(noise(rng, sd))
         ratios.append(peak / floor)
         assert is_at_rest(peak, floor, STILL, SETTINGS)
     assert np.median(ratios) == pytest.approx(2.0, abs=0.2), "the number in the settings' comment"
@@ -47,21 +52,30 @@ def test_noise_of_any_strength_is_rest(sd: float) -> None:
 def test_ground_that_moves_is_no_rest_even_at_0_db(speed: float, snr_db: float) -> None:
     rng = np.random.default_rng(12)
     for _ in range(50):
-        peak, floor = peak_and_floor(spectrum(ground(rng, speed, snr_db)), 4)
+        peak, floor = peak_and_floor(ground(rng, speed, snr_db))
         assert not is_at_rest(peak, floor, STILL, SETTINGS)
 
 
 def test_a_floor_is_found_under_ground_that_fills_half_the_axis() -> None:
     rng = np.random.default_rng(13)
-    floors = [peak_and_floor(spectrum(ground(rng, 1.7, 20)), 4)[1] for _ in range(20)]
-    quiet = [peak_and_floor(spectrum(noise(rng)), 4)[1] for _ in range(20)]
+    floors = [peak_and_floor(ground(rng, 1.7, 20))[1] for _ in range(20)]
+    quiet = [peak_and_floor(noise(rng))[1] for _ in range(20)]
     assert np.median(floors) < 2 * np.median(quiet)
+
+
+def test_the_sides_of_the_spectrum_are_told_apart() -> None:
+    rng = np.random.default_rng(15)
+    coming = ground(rng, 0.8, 15)
+    approaching, receding, floor = peaks_and_floor(spectrum(coming), 4)
+    assert approaching > 50 * floor > 10 * receding
+    mirrored = peaks_and_floor(spectrum(coming.conj()), 4)
+    assert mirrored == pytest.approx((receding, approaching, floor), rel=1e-4)
 
 
 def test_what_stands_or_drifts_by_less_than_a_cell_is_rest() -> None:
     rng = np.random.default_rng(14)
     for drift in (0.0, 0.02):  # m/s; a cell is 0.054
-        peak, floor = peak_and_floor(spectrum(ground(rng, drift, 15)), 4)
+        peak, floor = peak_and_floor(ground(rng, drift, 15))
         assert is_at_rest(peak, floor, STILL, SETTINGS)
 
 

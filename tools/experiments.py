@@ -209,7 +209,8 @@ def _simulate(path: Path) -> None:
     program = [sys.executable, "-m", "caneflow.command"]
     done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
     if done.returncode:
-        raise CaneflowError(f"caneflow {' '.join(words)}: {done.stderr.strip() or f'status {done.returncode}'}")
+        said = " ".join(done.stderr.split()) or f"status {done.returncode}"
+        raise CaneflowError(f"caneflow {' '.join(words)}: {said}")
     unfinished.rename(path)
 
 

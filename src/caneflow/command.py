@@ -22,10 +22,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "run": ("run", "Run a flow: live, or from a recording."),
     "check": ("check", "Find every mistake in a dataflow file; start nothing."),
     "graph": ("graph", "Draw a flow."),
-    "verify": (
-        "verify",
-        "Run a recording through processes and in one process; say whether the outputs are equal.",
-    ),
+    "verify": ("verify", "Run a recording again and compare with the outputs that it holds."),
     "status": ("status", "Show the nodes and edges of a running flow."),
     "hz": ("hz", "Show how often the samples of a running flow come."),
     "echo": ("echo", "Print the samples of a running flow."),
@@ -66,6 +63,9 @@ def main() -> NoReturn:
     try:
         _command().main(prog_name="caneflow")
     except CaneflowError as error:
+        if getattr(error, "problems", ()):  # each line begins with its own file:line:column
+            print(error, file=sys.stderr)
+            sys.exit(USAGE_STATUS)
         _fail(str(error))
     except OSError as error:
         if error.filename is None:

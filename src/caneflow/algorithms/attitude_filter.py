@@ -8,19 +8,27 @@ inclination never is. What has to be corrected again and again is the gyro's bia
 
 The idea of low-passing in an almost inertial frame is VQF's: D. Laidig, T. Seel, "VQF: Highly accurate IMU
 orientation estimation with bias estimation and magnetic disturbance rejection", Information Fusion 91, 2023. The
-filters here are other ones: two first-order low passes (so that any interval will do), a scalar Kalman filter for yaw.
+filters here are others: two first-order low passes (so that any interval will do), a scalar Kalman filter for yaw.
 
 World: x east, y magnetic north, z up.
 """
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
 from annotated_types import Gt
 
 from caneflow.algorithms.dead_reckoning import LONGEST_INTERVAL, SampleClock
-from caneflow.algorithms.gyro_bias import NOTHING_SEEN, GyroBias, GyroBiasSettings, RestDetector, Row, followed_row, horizontal_rows, vertical_row
+from caneflow.algorithms.gyro_bias import (
+    NOTHING_SEEN,
+    GyroBias,
+    GyroBiasSettings,
+    RestDetector,
+    Row,
+    followed_row,
+    horizontal_rows,
+    vertical_row,
+)
 from caneflow.algorithms.initial_attitude import AttitudeEstimate, level, required_start
 from caneflow.algorithms.magnetic_heading import MagneticHeading, MagneticHeadingSettings
 from caneflow.algorithms.rotations import (
@@ -61,7 +69,7 @@ class AttitudeFilter:
 
     @property
     def gaps(self) -> int:
-        """How many intervals were longer than LONGEST_INTERVAL: inclination starts anew, yaw goes on as it was."""
+        """How many intervals were longer than LONGEST_INTERVAL; after each the attitude starts anew."""
         return self._clock.gaps
 
     @property
@@ -86,22 +94,22 @@ class AttitudeFilter:
 
         Raises ValueError when time does not go on, or for a first reading without `accel`.
         """
-        if self._attitude is None:
-            start = level(required_start(accel, "attitude_filter"))
-            self._clock.interval(stamp_ns)
-            interval, attitude = 0.0, start
-        else:
-            elapsed = self._clock.interval(stamp_ns)
-            assert elapsed is not None  # the clock has had its first stamp
-            interval, attitude = elapsed, self._attitude
-            if interval > LONGEST_INTERVAL:
-                attitude = self._after_gap(attitude, accel, interval)
-                interval = 0.0
-            else:
-                attitude = self._turned(attitude, gyro, interval)
+        attitude, interval = self._predicted(stamp_ns, gyro, accel)
         self._gyro = gyro
         self._attitude = self._corrected(attitude, gyro, accel, mag, interval)
         return AttitudeEstimate(self._with_yaw(self._attitude), self._bias.bias)
+
+    def _predicted(self, stamp_ns: int, gyro: Vector, accel: Vector | None) -> tuple[Quaternion, float]:
+        """The attitude by the gyro alone, and the s over which it was integrated."""
+        if self._attitude is None:
+            start = level(required_start(accel, "attitude_filter"))
+            self._clock.interval(stamp_ns)
+            return start, 0.0
+        interval = self._clock.interval(stamp_ns)
+        assert interval is not None  # the clock has had its first stamp
+        if interval > LONGEST_INTERVAL:
+            return self._after_gap(self._attitude, accel), 0.0
+        return self._turned(self._attitude, gyro, interval), interval
 
     def _turned(self, attitude: Quaternion, gyro: Vector, interval: float) -> Quaternion:
         """By the mean of this reading and the one before, less the bias."""
@@ -115,8 +123,8 @@ class AttitudeFilter:
         )
         return normalized(multiply(attitude, from_rotation_vector(turn)))
 
-    def _after_gap(self, attitude: Quaternion, accel: Vector | None, interval: float) -> Quaternion:
-        """Level by this reading, as at the start; what is known of yaw is forgotten."""
+    def _after_gap(self, attitude: Quaternion, accel: Vector | None) -> Quaternion:
+        """Level by this reading, as at the start; the next magnetometer reading says yaw anew."""
         self._gravity.restart()
         self._rest.restart()
         self._heading.forget()
@@ -138,8 +146,8 @@ class AttitudeFilter:
                 attitude = multiply(correction, attitude)
                 tilt = 2.0 * correction[1], 2.0 * correction[2]
         if mag is not None:
-            field, row = rotate(attitude, mag), vertical_row(attitude, self._bias.bias)
-            turn = self._heading.update(field, row, gyro, self._since_field)
+            row = vertical_row(attitude, self._bias.bias)
+            turn = self._heading.update(rotate(attitude, mag), row, gyro, self._since_field)
             self._since_field = 0.0
         if interval > 0.0:
             self._learn_bias(gyro, accel, tilt, turn, interval)

@@ -1,10 +1,10 @@
 """What a gyro says when nothing turns, learnt at rest and, more slowly, from how an attitude must be corrected.
 
 A bias error e (body) turns the estimated attitude by R e per second (R: body to world), and whatever corrects the
-attitude turns it back. The rate of correction is -R e behind the low pass that the correction went through; with what
-was taken off the gyro behind the same low pass, it measures H times the bias, H being R behind the low pass. The bias
-is a random walk with a 3 x 3 covariance, corrected by such scalar measurements: what has not been seen stays unknown,
-the part along gravity above all.
+attitude turns it back. The rate of correction is -R e behind the low pass that the correction went through; with
+what was taken off the gyro behind the same low pass, it measures H times the bias, H being R behind the low pass.
+The bias is a random walk with a 3 x 3 covariance, corrected by such scalar measurements: what has not been seen
+stays unknown, the part along gravity above all.
 
 After VQF's (D. Laidig, T. Seel, Information Fusion 91, 2023), simplified.
 """
@@ -34,7 +34,9 @@ class GyroBiasSettings:
     walk: Annotated[float, Gt(0)] = math.radians(0.01)  # rad/s/sqrt(s): 0.1 deg/s in 100 s
     # sd of a measurement over 1 s:
     rest_noise: Annotated[float, Gt(0)] = math.radians(0.05)  # rad/s, at rest, beside what follows
-    sway: Annotated[float, Ge(0)] = 4.0  # times the gyro's own deviations at rest: a hand that is still is not quite
+    sway: Annotated[float, Ge(0)] = (
+        4.0  # times the gyro's own deviations at rest: a hand that is still is not quite
+    )
     tilt_noise: Annotated[float, Gt(0)] = math.radians(1.0)  # rad/s, of a correction by gravity
     heading_noise: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/s, of a correction by magnetic north
     rest_gyro: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/s, largest deviation from the mean at rest
@@ -100,7 +102,9 @@ class GyroBias:
         self._xy = self._xz = self._yz = 0.0
         self._gyro: Vector = (0.0, 0.0, 0.0)  # rad, at rest since the last correction
         self._rested = 0.0  # s
-        self._clear()
+        self._tilt = (0.0, 0.0)  # rad, since the last correction
+        self._turn = 0.0  # rad
+        self._elapsed = self._tilted = self._turned = 0.0  # s
 
     @property
     def bias(self) -> Vector:
@@ -113,7 +117,7 @@ class GyroBias:
         return math.sqrt(self._xx), math.sqrt(self._yy), math.sqrt(self._zz)
 
     def at_rest(self, gyro: Vector, deviation: float, interval: float) -> None:
-        """A sample at rest: the gyro says its bias, but for a sway of which `deviation` (rad/s) is the quick part."""
+        """A sample at rest: the gyro says its bias, and a sway of which `deviation` (rad/s) is the quick part."""
         self._gyro = (
             self._gyro[0] + interval * gyro[0],
             self._gyro[1] + interval * gyro[1],
@@ -150,12 +154,8 @@ class GyroBias:
                     self._correct_by(row, angle, self._tilted, self._settings.tilt_noise)
             if self._turned > 0.0:
                 self._correct_by(turn_row, self._turn, self._turned, self._settings.heading_noise)
-            self._clear()
-
-    def _clear(self) -> None:
-        self._tilt = (0.0, 0.0)  # rad
-        self._turn = 0.0  # rad
-        self._elapsed = self._tilted = self._turned = 0.0  # s
+            self._tilt, self._turn = (0.0, 0.0), 0.0
+            self._elapsed = self._tilted = self._turned = 0.0
 
     def _correct_at_rest(self, deviation: float) -> None:
         lasted, settings = self._rested, self._settings

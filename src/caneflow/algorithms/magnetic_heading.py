@@ -18,6 +18,7 @@ from caneflow.algorithms.rotations import Vector, wrapped
 SMOOTHING = 0.1  # s, of strength and dip: the magnetometer's noise is no disturbance
 TURNING = math.radians(20.0)  # rad/s; a field that is steady while the body turns is no magnet that it carries
 LARGEST_DISTRUST = 1000.0
+SETTLED = 1.5  # times the steady variance, below which corrections are of now, not of what was
 LEAST_LEVEL = 1e-3  # of the field's strength; a field as steep as that has no yaw
 
 
@@ -128,7 +129,7 @@ class MagneticHeading:
             interval: s since the reading before.
 
         Returns:
-            The correction in rad; None for the first one, which is a start, and for a field that is no use.
+            The correction in rad, where it tells of the gyro's bias: not at the start, nor near a disturbance.
         """
         east, north, up = magnetic
         level = math.sqrt(east * east + north * north)
@@ -139,14 +140,12 @@ class MagneticHeading:
         turn_rate = math.sqrt(gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2])
         self._deviation = self._reference.deviation(strength, math.atan2(-up, level), turn_rate, interval)
         distrust = min(1.0 + 10.0 * self._deviation**4, LARGEST_DISTRUST)
-        starts = math.isinf(self._variance)
         gain = self._gain(distrust * self._settings.time_constant**2, interval)
         turn = gain * wrapped(NORTH_YAW - math.atan2(north, east) - self.offset)
         self.offset = wrapped(self.offset + turn)
-        if starts:
-            return None
         self.row = followed_row(self.row, row, gain)
-        return turn
+        settled = self._variance < SETTLED * self._settings.time_constant and not self.disturbed
+        return turn if settled else None
 
     def _gain(self, noise: float, interval: float) -> float:
         """The Kalman gain; `noise` in s^2, the variance of a reading that stands for 1 s."""

@@ -20,8 +20,10 @@ from caneflow.algorithms.edges import EDGE_BEYOND_SPEED, superior_edges
 from caneflow.algorithms.footprint import NO_RAYS, CaneGeometry, Fan, RayCaster, Rays, antenna_height, pitch
 from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
 from caneflow.algorithms.range_doppler import SlowTimeWindow, hann, speed_per_bin
-from caneflow.algorithms.rest import RestSettings, is_at_rest, peak_and_floor
+from caneflow.algorithms.rest import RestSettings, is_at_rest, peaks_and_floor
 from caneflow.algorithms.rotations import Quaternion
+
+RECEDING_SHARE = 0.25  # of the approaching peak: with a beam of 50 deg, walking and swinging stay below it
 
 Average: TypeAlias = Literal["mean", "median", "weighted"]
 
@@ -107,13 +109,12 @@ class PaperSpeed:
             return _nothing(delay)
         power = self._power(rays)
         spectrum = power.sum(axis=0)
-        peak, floor = peak_and_floor(spectrum, self._cell)
+        approaching, receding, floor = peaks_and_floor(spectrum, self._cell)
         turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
-        if turn_rate is not None and is_at_rest(peak, floor, turn_rate, settings.rest):
+        if turn_rate is not None and is_at_rest(max(approaching, receding), floor, turn_rate, settings.rest):
             return SpeedEstimate(speed=0.0, quality=0.0, rays=settings.rays, valid=True, delay=delay)
-        half = settings.transform // 2
-        if spectrum[half:].sum() > spectrum[:half].sum():
-            return _nothing(delay)  # receding ground, or so fast that its Doppler comes round from the other side
+        if self._has_come_round(spectrum, approaching, receding, floor):
+            return _nothing(delay)
         per_bin = speed_per_bin(
             scan_period=2 * delay / (settings.window - 1),  # measured, not nominal
             carrier=returns.parameters.carrier,
@@ -155,6 +156,14 @@ class PaperSpeed:
         summed = power[:-2] + power[1:-1]
         summed += power[2:]
         return summed
+
+    def _has_come_round(
+        self, spectrum: NDArray[np.float32], approaching: float, receding: float, floor: float
+    ) -> bool:
+        """Whether ground recedes, or approaches so fast that some of its Doppler shows on the other side."""
+        half = len(spectrum) // 2
+        stands_out = receding > self._settings.least_peak * floor and receding > RECEDING_SHARE * approaching
+        return stands_out or bool(spectrum[half:].sum() > spectrum[:half].sum())
 
     def _ray_speeds(
         self, power: NDArray[np.float32], floor: float, per_bin: NDArray[np.float64]

@@ -32,8 +32,8 @@ class RestSettings:
     largest_turn_rate: Annotated[float, Gt(0)] = math.radians(5.0)  # rad/s, mean norm over the window
 
 
-def peak_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, float]:
-    """The highest Doppler power outside of the standing cells, and the noise floor to hold it against.
+def peaks_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, float, float]:
+    """The highest Doppler power approaching and receding, without the standing cells, and the floor to hold it against.
 
     Args:
         power: shape (L,), slow-time power spectrum of a window of scans, in sum over ranges, in FFT order.
@@ -44,7 +44,8 @@ def peak_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, flo
     """
     standing = math.ceil(STANDING_CELLS * cell)
     floor = np.sort(power)[len(power) // 4]
-    return float(power[standing : 1 - standing].max()), float(floor)
+    half = len(power) // 2
+    return float(power[standing:half].max()), float(power[half : 1 - standing].max()), float(floor)
 
 
 def is_at_rest(peak: float, floor: float, turn_rate: float, settings: RestSettings) -> bool:

@@ -1,14 +1,14 @@
 """Strapdown inertial navigation of a foot, which stands still once in every step.
 
-Gyro and accelerometer are integrated to attitude, velocity and position; an error-state Kalman filter follows what they
-are off by. While the foot stands, its velocity is zero: an error seen, and with it, by their correlations, the
-position's and the tilt's. Between two stances the error grows for a second instead of for the walk.
+Gyro and accelerometer are integrated to attitude, velocity and position; an error-state Kalman filter follows what
+they are off by. While the foot stands, its velocity is zero: an error seen, and with it, by their correlations,
+the position's and the tilt's. Between two stances the error grows for a second instead of for the walk.
 
-E. Foxlin, "Pedestrian tracking with shoe-mounted inertial sensors", IEEE CG&A 25(6), 2005; the stance detector (SHOE)
-from I. Skog, P. Haendel, J.-O. Nilsson, J. Rantakokko, "Zero-velocity detection - an algorithm evaluation", IEEE TBME
-57(11), 2010.
+E. Foxlin, "Pedestrian tracking with shoe-mounted inertial sensors", IEEE CG&A 25(6), 2005; the stance detector
+(SHOE) from I. Skog, P. Haendel, J.-O. Nilsson, J. Rantakokko, "Zero-velocity detection - an algorithm evaluation",
+IEEE TBME 57(11), 2010.
 
-State error: position, velocity, attitude (a small turn in the world), gyro bias, accelerometer bias; 3 numbers each.
+State error: position, velocity, attitude (a small turn in the world), gyro bias, accelerometer bias; each three.
 World: z up, origin and yaw those of the first sample.
 """
 
@@ -27,16 +27,17 @@ from caneflow.algorithms.rotations import Quaternion, Vector, from_rotation_vect
 
 Matrix: TypeAlias = NDArray[np.float64]
 
+WALKING = 1.5  # m/s, sd of a foot's velocity when nothing is known
 STATES = 15
 POSITION, VELOCITY, TILT, GYRO_BIAS, ACCEL_BIAS = (slice(3 * k, 3 * k + 3) for k in range(5))
 
 
 @dataclass(frozen=True, kw_only=True)
 class StanceSettings:
-    """When the foot counts as standing: the test statistic of SHOE, its noises and threshold in one pair of numbers.
+    """When the foot counts as standing: SHOE's test statistic, with noises and threshold as one pair of numbers.
 
-    At the threshold the specific force deviates from gravity by `accel`, or the foot turns by `gyro` (RMS over the
-    window, either alone). Skog's noises and threshold, 0.01 m/s^2, 0.1 deg/s and 0.3e5, are 1.7 m/s^2 and 17 deg/s.
+    At the threshold the specific force deviates from gravity by `accel`, or the foot turns by `gyro`: RMS over the
+    window, either alone. Skog's noises and threshold, 0.01 m/s^2, 0.1 deg/s and 0.3e5, are 1.7 m/s^2, 17 deg/s.
     """
 
     window: Annotated[float, Gt(0)] = 0.04  # s; the newest samples
@@ -49,9 +50,11 @@ class ZeroVelocitySettings:
     """Noises of the sensors and of a standing foot."""
 
     stance: StanceSettings = StanceSettings()
-    velocity_noise: Annotated[float, Gt(0)] = 0.01  # m/s, sd of a standing foot's velocity, per sample
-    rest_time: Annotated[float, Gt(0)] = 1.0  # s; a stance that lasts longer is no step: the foot does not turn either
-    turn_noise: Annotated[float, Gt(0)] = math.radians(0.5)  # rad/s, sd of a resting foot's turn rate, per sample
+    velocity_noise: Annotated[float, Gt(0)] = 0.01  # m/s/sqrt(Hz), of a standing foot, which still rolls a little
+    rest_time: Annotated[float, Gt(0)] = (
+        1.0  # s; a stance that lasts longer is no step: the foot does not turn either
+    )
+    turn_noise: Annotated[float, Gt(0)] = math.radians(0.05)  # rad/s/sqrt(Hz), of a foot at rest
     accel_noise: Annotated[float, Gt(0)] = 0.02  # m/s^2/sqrt(Hz); with what a foot adds: scale, bandwidth, impacts
     gyro_noise: Annotated[float, Gt(0)] = math.radians(0.02)  # rad/s/sqrt(Hz), likewise
     accel_bias: Annotated[float, Gt(0)] = 0.1  # m/s^2, sd at the start
@@ -62,7 +65,7 @@ class ZeroVelocitySettings:
 
 
 class StanceDetector:
-    """SHOE: is the window explained by gravity, along its mean specific force, and no turn?"""
+    """SHOE: whether gravity, along the mean specific force, and no turn explain the window."""
 
     def __init__(self, settings: StanceSettings) -> None:
         self._settings = settings
@@ -117,11 +120,10 @@ class ZeroVelocity:
         self._covariance = _initial_covariance(settings)
         self._stood = 0.0  # s, since the last movement
         self.standing = False  # as of the last sample
-        self.stances = 0  # samples that counted as standing
 
     @property
     def gaps(self) -> int:
-        """How many intervals were longer than LONGEST_INTERVAL; the foot is taken to have stood through them."""
+        """How many intervals were longer than LONGEST_INTERVAL; nothing is integrated over them."""
         return self._clock.gaps
 
     @property
@@ -152,21 +154,22 @@ class ZeroVelocity:
         """
         if accel is None:
             raise ValueError("zero_velocity: the imu sample has no accel; it needs the raw specific force")
-        start = level(accel) if self._orientation is None else self._orientation
+        before = level(accel) if self._orientation is None else self._orientation
         interval = self._clock.interval(stamp_ns)
         gyro_used, force_used = self._less_bias(gyro, accel)
-        if interval is None or interval > LONGEST_INTERVAL:
-            orientation = self._after_gap(start, interval)
-            self._force = rotate(orientation, force_used)
+        if interval is None:
+            self._orientation, self._force = before, rotate(before, force_used)
+        elif interval > LONGEST_INTERVAL:
+            self._orientation, self._force = before, rotate(before, force_used)
+            self._forget(interval)
         else:
-            orientation = self._integrate(start, gyro_used, force_used, interval)
-            self._propagate(orientation, interval)
-        self._gyro, self._orientation = gyro_used, orientation
+            self._orientation = self._integrate(before, gyro_used, force_used, interval)
+            self._propagate(self._orientation, interval)
+        self._gyro = gyro_used
         self.standing = self._stance.update(stamp_ns, gyro, accel)
         if self.standing:
-            self.stances += 1
-            self._stood += interval or 0.0
-            self._stop(gyro_used)
+            assert interval is not None  # a window is longer than one sample
+            self._stop(gyro_used, interval)
         else:
             self._stood = 0.0
         return PoseEstimate(self._position, self._velocity, self._orientation, self._covariance[:6, :6].copy())
@@ -215,34 +218,32 @@ class ZeroVelocity:
         self._covariance = step @ self._covariance @ step.T
         self._covariance.flat[:: STATES + 1] += noise
 
-    def _after_gap(self, orientation: Quaternion, interval: float | None) -> Quaternion:
-        """Nothing is integrated over a gap; where the foot went is unknown by a walker's speed."""
+    def _forget(self, interval: float) -> None:
+        """Integrate nothing over a gap: the state gets as unknown as a walk makes it."""
         self._stance.restart()
-        self._velocity = (0.0, 0.0, 0.0)
-        if interval is not None:
-            p = self._covariance
-            p[VELOCITY, :] = p[:, VELOCITY] = p[TILT, :] = p[:, TILT] = 0.0
-            for block, sd in ((POSITION, WALKING * interval), (VELOCITY, WALKING), (TILT, 1.0)):
-                p[block, block] += sd**2 * np.eye(3)
-        return orientation
+        self._stood, self._velocity = 0.0, (0.0, 0.0, 0.0)
+        p = self._covariance
+        for block, added in ((POSITION, WALKING * interval), (VELOCITY, WALKING), (TILT, 1.0)):
+            p[block, block] += added**2 * np.eye(3)
 
-    def _stop(self, gyro: Vector) -> None:
+    def _stop(self, gyro: Vector, interval: float) -> None:
         """What a standing foot tells: a velocity of zero and, if it is no step, a gyro that reads its bias."""
         settings = self._settings
         x, y, z = self._velocity
-        self._correct(VELOCITY, (-x, -y, -z), settings.velocity_noise)
+        self._correct(VELOCITY, (-x, -y, -z), settings.velocity_noise**2 / interval)
+        self._stood += interval
         if self._stood >= settings.rest_time:
-            self._correct(GYRO_BIAS, gyro, settings.turn_noise)
+            self._correct(GYRO_BIAS, gyro, settings.turn_noise**2 / interval)
 
-    def _correct(self, seen: slice, residual: Vector, sd: float) -> None:
-        """The Kalman filter's update by three of the states, seen with noise of `sd` each; Joseph form."""
-        p = self._covariance
-        noise = sd**2 * np.eye(3)
+    def _correct(self, seen: slice, residual: Vector, variance: float) -> None:
+        """The Kalman filter's update by three of the states, each seen with a noise of `variance`; Joseph form."""
+        p: Matrix = self._covariance
+        noise = variance * np.eye(3)
         gain: Matrix = np.linalg.solve(p[seen, seen] + noise, p[seen, :]).T  # (STATES, 3)
         kept = np.eye(STATES)
         kept[:, seen] -= gain
-        p = kept @ p @ kept.T + gain @ noise @ gain.T
-        self._covariance = 0.5 * (p + p.T)
+        corrected = kept @ p @ kept.T + gain @ noise @ gain.T
+        self._covariance = np.asarray(0.5 * (corrected + corrected.T), dtype=np.float64)
         self._apply((gain @ np.array(residual)).tolist())
 
     def _apply(self, error: list[float]) -> None:
@@ -254,9 +255,6 @@ class ZeroVelocity:
         self._accel_bias = _sum(self._accel_bias, error, 12)
         self._orientation = normalized(multiply(turn, self._orientation))
         self._force = rotate(turn, self._force)
-
-
-WALKING = 1.5  # m/s
 
 
 def _initial_covariance(settings: ZeroVelocitySettings) -> Matrix:

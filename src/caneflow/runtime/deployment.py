@@ -55,6 +55,8 @@ def deploy(
     graph: Graph, *, replay: Replay | None = None, record: Path | None = None, rig: dict[str, Any] | None = None
 ) -> Deployment:
     """The plans of one run; raises DataflowError when the recording does not fit the graph."""
+    if replay and record and record.exists() and record.samefile(replay.recording):
+        raise DataflowError(f"--record {record}: is the recording that is replayed; write to another file")
     without = replay.without if replay else frozenset()
     if unknown := without - graph.nodes.keys():
         raise DataflowError(f"--without {min(unknown)}: no such node; there are {', '.join(graph.nodes)}")

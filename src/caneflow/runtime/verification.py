@@ -71,7 +71,7 @@ def verify(graph: Graph, path: Path, *, tolerance: float = 0.0) -> Verification:
     """Run the recording at `path` through `graph` and compare every operator's output that it holds.
 
     Equal bytes; or, where those differ, numbers within `tolerance` (absolute, SI units) and all else equal. What
-    the recorded live run did not handle (`@/late`) is left out. Raises DataflowError if there is nothing to compare.
+    the recorded live run did not handle (`@/late`) is left out. Raises DataflowError when there is none to compare.
     """
     deployment = deploy(graph, replay=Replay(recording=path, speed=math.inf))
     with Recording(path) as recording:
