@@ -17,7 +17,6 @@ from caneflow.algorithms.initial_attitude import NORTH_YAW, AttitudeMethod
 from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, from_yaw, multiply, normalized, rotate
 from caneflow.messages import Imu, Sample
-from caneflow.messages.samples import UNNUMBERED
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 
@@ -58,15 +57,8 @@ class Attitude(Operator):
         except ValueError as error:
             raise Refused(str(error)) from error
         orientation = normalized(multiply(self._to_rig, estimate.orientation))
-        yield (
-            "imu",
-            msgspec.structs.replace(
-                message,
-                seq=UNNUMBERED,
-                orientation=orientation,
-                linear_accel=linear_acceleration(orientation, message.accel),
-            ),
-        )
+        linear = linear_acceleration(orientation, message.accel)
+        yield "imu", msgspec.structs.replace(message, orientation=orientation, linear_accel=linear)
 
 
 def attitude_method(settings: AttitudeSettings) -> AttitudeMethod:

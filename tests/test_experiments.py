@@ -48,7 +48,7 @@ METHODS = ("luenberger", "naive_ins")
 
 
 def page(results: dict[str, list[Evaluation]]) -> str:
-    return "\n".join(experiments.page(results, METHODS, 10, {}))
+    return "\n".join(experiments.page(results, METHODS, {}))
 
 
 def rows(text: str, first: str) -> list[list[str]]:

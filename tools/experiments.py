@@ -107,7 +107,7 @@ def command(
         Path, typer.Option(metavar="DIR", help="Where the walks are kept until the simulator changes.")
     ] = Path("build/experiments"),
 ) -> None:
-    """Simulate the walks that are not there yet (20 s each), run every method over them, write the page.
+    """Simulate the walks that are not there yet (10 s each), run every method over them, write the page.
 
     The same sources write the same page again. Exit status 1: some walk or method failed; the page says which.
 
@@ -127,7 +127,9 @@ def command(
     pictures = output.parent / "pictures"
     pictures.mkdir(parents=True, exist_ok=True)
     drawn = draw(pyplot, results, methods, pictures)
-    output.write_text("\n".join(page(results, methods, seeds, drawn)) + "\n", encoding="utf-8")
+    made_by = f"caneflow experiments --seeds {seeds}" + (f" --only {only}" if only else "")
+    lines = [*_head(made_by, seeds), *page(results, methods, drawn)]
+    output.write_text("\n".join(lines) + "\n", encoding="utf-8")
     if any(result.failures for result in by_path.values()):
         print(f"caneflow experiments: some walks failed; {output} says which", file=sys.stderr)
         raise typer.Exit(FAILED_STATUS)
@@ -155,10 +157,9 @@ def simulate(missing: Sequence[Path], jobs: int) -> None:
 
 
 def page(
-    results: Mapping[str, Sequence[Evaluation]], methods: Sequence[str], seeds: int, drawn: Mapping[str, str]
+    results: Mapping[str, Sequence[Evaluation]], methods: Sequence[str], drawn: Mapping[str, str]
 ) -> Iterator[str]:
-    """The page, line by line. `drawn`: links to pictures by what they show."""
-    yield from _head(seeds)
+    """The results, line by line. `drawn`: links to pictures by what they show."""
     if ONE_WALK in results:
         yield from _table_one(results[ONE_WALK], methods)
     for link in drawn.values():
@@ -234,13 +235,13 @@ def _shown(items: Iterator[Item], text: str, total: int) -> Iterator[Item]:
     return iter(track(items, text, total=total, console=console, transient=True, disable=hidden))
 
 
-def _head(seeds: int) -> Iterator[str]:
+def _head(made_by: str, seeds: int) -> Iterator[str]:
     versions = f"caneflow {caneflow.__version__}, Python {platform.python_version()}"
     low, high = consistent_mean(seeds)
     yield f"""# Results
 
 The paper's experiments (Barra et al., ECC 2019, section VI) on simulated walks, and some more. This page and its
-pictures are written by `caneflow experiments --seeds {seeds}`; do not edit them. Made with {versions},
+pictures are written by `{made_by}`; do not edit them. Made with {versions},
 numpy {np.__version__}, scipy {scipy.__version__}.
 
 ## What was simulated, and what the paper measured

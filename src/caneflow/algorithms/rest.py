@@ -33,7 +33,7 @@ class RestSettings:
 
 
 def peaks_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, float, float]:
-    """The highest Doppler power approaching and receding, without the standing cells, and the floor to hold it against.
+    """The highest Doppler power, approaching and receding, outside of the standing cells; and the noise floor.
 
     Args:
         power: shape (L,), slow-time power spectrum of a window of scans, in sum over ranges, in FFT order.

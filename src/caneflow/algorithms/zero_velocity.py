@@ -237,9 +237,9 @@ class ZeroVelocity:
 
     def _correct(self, seen: slice, residual: Vector, variance: float) -> None:
         """The Kalman filter's update by three of the states, each seen with a noise of `variance`; Joseph form."""
-        p: Matrix = self._covariance
+        p = self._covariance
         noise = variance * np.eye(3)
-        gain: Matrix = np.linalg.solve(p[seen, seen] + noise, p[seen, :]).T  # (STATES, 3)
+        gain = np.asarray(np.linalg.solve(p[seen, seen] + noise, p[seen, :]).T, dtype=np.float64)  # (STATES, 3)
         kept = np.eye(STATES)
         kept[:, seen] -= gain
         corrected = kept @ p @ kept.T + gain @ noise @ gain.T
