@@ -143,17 +143,16 @@ def test_the_same_frames_give_the_same_bits() -> None:
     assert estimates(ground(0.6)) == estimates(ground(0.6))
 
 
-@pytest.mark.parametrize("speed", [2.5, 3.0, 3.6])
+@pytest.mark.parametrize("speed", [1.9, 2.4, 3.0, 3.6])
 def test_a_speed_beyond_the_limit_is_refused_not_wrapped(speed: float) -> None:
-    """The limit at 42 deg is c / (4 f T cos 42 deg) = 2.35 m/s."""
+    """The limit c / (4 f T cos(alpha)) is 1.88 m/s for the shallowest ray, 2.35 m/s in the beam's middle."""
     assert not any(e.valid for e in estimates(ground(speed)))
 
 
-@pytest.mark.parametrize("speed", [1.9, 2.1, 2.35])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_near_the_limit_a_speed_is_refused_or_nearly_right(speed: float, seed: int) -> None:
-    for e in estimates(ground(speed, seed)):
-        assert not e.valid or e.speed > 0.82 * speed
+@pytest.mark.parametrize("speed", [1.7, 1.8, 2.1, 2.3])
+def test_near_the_limit_a_speed_is_refused_or_nearly_right(speed: float) -> None:
+    for e in estimates(ground(speed)):
+        assert not e.valid or e.speed > 0.85 * speed
 
 
 def test_rays_that_see_only_noise_are_left_out() -> None:

@@ -128,7 +128,7 @@ class HeadingHypotheses:
         if len(self._times) == self._settings.knots:
             self._thin()
         self._times.append(self._elapsed)
-        self._variances.append(self.variance)
+        self._variances.append(max(self.variance, self._variances[-1] if self._variances else 0.0))
         self._turns.append(self._turned)
         self._moves.append(self._since_knot)
         self._since_knot = 0j

@@ -1,0 +1,202 @@
+"""One graph, two hosts: streams that end early, never start, lag, or are filtered give the same bytes in both."""
+
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from caneflow.messages import Imu, decode, numbered, sample_key
+from caneflow.recording import Recording, RecordingWriter
+
+TICK = 10_000_000  # ns
+
+STREAM = '''
+"""Stands for a device: one IMU stream."""
+from caneflow.messages import Imu
+from caneflow.runtime import Source
+from caneflow.runtime.node import run
+
+class Stream(Source):
+    outputs = {"imu": Imu}
+
+    def __init__(self, settings, context): ...
+
+    def samples(self):
+        yield from ()
+
+if __name__ == "__main__":
+    run(Stream)
+'''
+
+EVERY_FIFTH = '''
+"""A filter: hands every fifth sample on."""
+from caneflow.messages import Imu
+from caneflow.runtime import Operator
+from caneflow.runtime.node import run
+
+class EveryFifth(Operator):
+    inputs = {"imu": Imu}
+    outputs = {"imu": Imu}
+
+    def __init__(self, settings, context):
+        self.seen = 0
+
+    def handle(self, port, message):
+        self.seen += 1
+        if self.seen % 5 == 0:
+            yield "imu", Imu(stamp=message.stamp, gyro=message.gyro)
+
+if __name__ == "__main__":
+    run(EveryFifth)
+'''
+
+ORDER = '''
+"""Says in which order things came, and a random number each time: gyro = (port, seq, random)."""
+from caneflow.messages import Imu
+from caneflow.runtime import Operator
+from caneflow.runtime.node import run
+
+class Order(Operator):
+    inputs = {"a": Imu, "b": Imu, "c": Imu, "d": Imu}
+    optional_inputs = frozenset("abcd")
+    outputs = {"seen": Imu}
+
+    def __init__(self, settings, context):
+        self.random = context.random
+        self.last = -1
+
+    def handle(self, port, message):
+        # Stamps of one output strictly increase: equal ones are told apart by a nanosecond.
+        self.last = max(message.stamp, self.last + 1)
+        yield "seen", Imu(stamp=self.last, gyro=("abcd".index(port), float(message.seq), self.random.normal()))
+
+    def finish(self):
+        yield "seen", Imu(stamp=self.last + 1, gyro=(-1.0, 0.0, 0.0))
+
+if __name__ == "__main__":
+    run(Order)
+'''
+
+FLOW = """
+flow: order
+seed: 5
+nodes:
+  a: {run: ./stream.py}
+  b: {run: ./stream.py}
+  c: {run: ./stream.py}
+  d: {run: ./stream.py}
+  fifth: {run: ./every_fifth.py, inputs: {imu: d/imu}}
+  order: {run: ./order.py, inputs: {a: a/imu, b: b/imu, c: c/imu, d: fifth/imu}}
+results: [order/seen]
+"""
+
+Stamps = Mapping[str, list[int]]
+
+CASES: dict[str, dict[str, list[int]]] = {
+    "equal stamps": {name: [i * TICK for i in range(100)] for name in "abcd"},
+    "ends early": {
+        "a": [i * TICK for i in range(300)],
+        "b": [i * TICK for i in range(20)],
+        "c": [i * TICK + 3 for i in range(300)],
+        "d": [i * TICK for i in range(40)],
+    },
+    "hardly starts": {  # a recording knows a stream by its samples: one at the very end
+        "a": [i * TICK for i in range(200)],
+        "b": [200 * TICK],
+        "c": [0],
+        "d": [i * TICK for i in range(200)],
+    },
+    "lags by seconds": {
+        "a": [i * TICK for i in range(1200)],
+        "b": [i * TICK for i in range(600, 1200)],
+        "c": [i * 300 * TICK + 7 for i in range(4)],
+        "d": [i * 11 * TICK for i in range(100)],
+    },
+}
+
+
+@pytest.fixture
+def flow(tmp_path: Path) -> Path:
+    for name, text in {"stream": STREAM, "every_fifth": EVERY_FIFTH, "order": ORDER}.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    path = tmp_path / "order.yaml"
+    path.write_text(FLOW)
+    return path
+
+
+def recorded(path: Path, stamps: Stamps) -> Path:
+    """A recording of the streams, received one whole stream after the other: reception says nothing."""
+    with RecordingWriter(path, flow="order", source="simulated", rig={}) as writer:
+        for node, of_node in stamps.items():
+            for seq, stamp in enumerate(of_node):
+                payload = numbered(Imu(stamp=stamp, gyro=(0.0, 0.0, 0.0)), seq)
+                key = sample_key("order", node, "imu")
+                writer.write(key, Imu, payload, stamp=stamp, seq=seq, log_time=stamp)
+    return path
+
+
+def seen(flow: Path, recording: Path, out: Path, *options: str) -> list[bytes]:
+    command = [sys.executable, "-m", "caneflow.command", "run", str(flow), "--replay", str(recording)]
+    done = subprocess.run(
+        [*command, "--record", str(out), *options], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    with Recording(out) as got:
+        return [sample.payload for sample in got.samples([("order", "seen")])]
+
+
+def expected(stamps: Stamps, start: int = 0) -> list[tuple[int, int]]:
+    """The slow, obvious order: (port, seq) sorted by stamp, port; d thinned out; numbers from the start on."""
+    kept = {name: [s for s in of_node if s >= start] for name, of_node in stamps.items()}
+    kept["d"] = kept["d"][4::5]
+    every = sorted((stamp, port, seq) for port, name in enumerate("abcd") for seq, stamp in enumerate(kept[name]))
+    return [(port, seq) for _, port, seq in every]
+
+
+def order_of(payloads: list[bytes]) -> list[tuple[int, int]]:
+    gyros = [decode(payload, Imu).gyro for payload in payloads]
+    assert gyros[-1] == (-1.0, 0.0, 0.0), "the operator was told of the end"
+    return [(int(port), int(seq)) for port, seq, _ in gyros[:-1]]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_in_one_process_the_order_is_that_of_the_stamps(flow: Path, tmp_path: Path, case: str) -> None:
+    recording = recorded(tmp_path / "in.mcap", CASES[case])
+    got = seen(flow, recording, tmp_path / "out.mcap", "--in-process")
+    assert order_of(got) == expected(CASES[case])
+
+
+@pytest.mark.parametrize("case", ["ends early", "lags by seconds"])
+def test_processes_give_the_same_bytes(flow: Path, tmp_path: Path, case: str) -> None:
+    recording = recorded(tmp_path / "in.mcap", CASES[case])
+    oracle = seen(flow, recording, tmp_path / "a.mcap", "--in-process")
+    assert seen(flow, recording, tmp_path / "b.mcap", "--speed", "max") == oracle
+
+
+def test_a_start_in_the_middle_is_the_same_in_both(flow: Path, tmp_path: Path) -> None:
+    stamps = CASES["lags by seconds"]
+    recording = recorded(tmp_path / "in.mcap", stamps)
+    oracle = seen(flow, recording, tmp_path / "a.mcap", "--in-process", "--start", "5")
+    assert order_of(oracle) == expected(stamps, start=5_000_000_000)
+    assert seen(flow, recording, tmp_path / "b.mcap", "--speed", "max", "--start", "5") == oracle
+
+
+def test_a_new_node_does_not_change_the_random_numbers_of_another(flow: Path, tmp_path: Path) -> None:
+    recording = recorded(tmp_path / "in.mcap", CASES["equal stamps"])
+    before = seen(flow, recording, tmp_path / "a.mcap", "--in-process")
+    text = flow.read_text()
+    flow.write_text(text.replace("results:", "  another: {run: ./order.py, inputs: {a: a/imu}}\nresults:"))
+    assert seen(flow, recording, tmp_path / "b.mcap", "--in-process") == before
+    flow.write_text(text.replace("seed: 5", "seed: 6"))
+    assert seen(flow, recording, tmp_path / "c.mcap", "--in-process") != before
+
+
+def test_a_node_left_out_ends_its_readers_inputs(flow: Path, tmp_path: Path) -> None:
+    stamps = CASES["equal stamps"]
+    recording = recorded(tmp_path / "in.mcap", stamps)
+    got = seen(flow, recording, tmp_path / "out.mcap", "--in-process", "--without", "b")
+    without = [(port, seq) for port, seq in expected(stamps) if port != 1]
+    # With b gone the port order stays; only its samples are missing.
+    assert order_of(got) == without
