@@ -180,9 +180,7 @@ def test_a_given_rig_is_laid_over_the_files_key_by_key(tmp_path: Path) -> None:
         "aperture": 0.9,
         "sensors": {"south": {"position": [4, -2.5, 1], "azimuth": 1.57, "k": 3.0}},
     }
-    with pytest.raises(
-        DataflowError, match=r"^rig of the recording or --rig: rig\.aperture: is 9; it takes a number"
-    ):
+    with pytest.raises(DataflowError, match=r"^rig of the recording or --rig: rig\.aperture: is 9; it takes a number"):
         load(path, rig={"aperture": 9})
 
 
@@ -196,8 +194,7 @@ def test_a_rig_may_lie_in_a_file_of_its_own(tmp_path: Path) -> None:
         read_rig(path)
     assert str(caught.value).splitlines() == [
         f"{path}:3:21: sensors.south.position: is [4, -2.5]; it takes a list of 3 (m, R0)",
-        f"{path}:3:47: sensors.south.postion: unknown key; did you mean 'position'? "
-        "allowed are azimuth, k, position",
+        f"{path}:3:47: sensors.south.postion: unknown key; did you mean 'position'? allowed are azimuth, k, position",
     ]
 
 

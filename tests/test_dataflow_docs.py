@@ -47,9 +47,7 @@ def test_the_example_of_the_page_is_sound(tmp_path: Path) -> None:
     assert load(path).warnings == ()
 
 
-@pytest.mark.parametrize(
-    "file", sorted(ROOT.glob("dataflow*.yaml")) + sorted(ROOT.glob("dataflows/*.yaml")), ids=str
-)
+@pytest.mark.parametrize("file", sorted(ROOT.glob("dataflow*.yaml")) + sorted(ROOT.glob("dataflows/*.yaml")), ids=str)
 def test_the_projects_flows_name_the_schema(file: Path) -> None:
     first = file.read_text(encoding="utf-8").splitlines()[0]
     match = re.fullmatch(r"# yaml-language-server: \$schema=(\S+)", first)

@@ -68,9 +68,7 @@ def test_the_radars_default_window_is_480_bins() -> None:
         ("p440", {"carrier": "4.3 GHz"}, "settings.carrier: is '4.3 GHz'; it takes a number, above 0"),
     ],
 )
-def test_settings_that_the_device_does_not_have_are_mistakes(
-    name: str, settings: dict[str, object], said: str
-) -> None:
+def test_settings_that_the_device_does_not_have_are_mistakes(name: str, settings: dict[str, object], said: str) -> None:
     with pytest.raises(DataflowError) as caught:
         validated_settings(driver(name), settings)
 

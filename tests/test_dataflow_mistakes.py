@@ -385,9 +385,7 @@ BROKEN_PROGRAMS = {
     "'bad.py' holds no program; that is a class derived from Operator, Source or Sink": "x = 1\n",
     "'bad.py' holds several programs: Speed, Other; one file holds one": SPEED + "\nclass Other(Speed): ...\n",
     "'bad.py': Speed does not define handle": SPEED.replace("def handle", "def handel"),
-    "'bad.py': Speed.inputs: 'Frame' is no name of a port; that is a lower-case": SPEED.replace(
-        '"frame"', '"Frame"'
-    ),
+    "'bad.py': Speed.inputs: 'Frame' is no name of a port; that is a lower-case": SPEED.replace('"frame"', '"Frame"'),
     "'bad.py': Speed.outputs is no table of ports; that is e.g. {'imu': Imu}": SPEED.replace(
         '{"speed": GroundSpeed}', '["speed"]'
     ),
@@ -420,9 +418,7 @@ def test_an_edited_program_is_read_anew(folder: Path) -> None:
     path = folder / "flow.yaml"
     path.write_text(FLOW)
     load(path)
-    (folder / "speed.py").write_text(
-        SPEED.replace('"frame"', '"fraem"')
-    )  # of the same size, within the same second
+    (folder / "speed.py").write_text(SPEED.replace('"frame"', '"fraem"'))  # of the same size, within the same second
 
     assert examine(path)[0] is None
 

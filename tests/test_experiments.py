@@ -150,8 +150,6 @@ def test_a_broken_walk_ends_the_command_with_status_1(tmp_path: Path) -> None:
     walk.parent.mkdir(parents=True)
     walk.write_text("cut")
     with pytest.raises(Exit) as ended:
-        experiments.command(
-            output=tmp_path / "results.md", seeds=1, only="swing", flow=FLOW, folder=tmp_path / "walks"
-        )
+        experiments.command(output=tmp_path / "results.md", seeds=1, only="swing", flow=FLOW, folder=tmp_path / "walks")
     assert ended.value.exit_code == 1
     assert "**Luenberger failed on swing_1**" in (tmp_path / "results.md").read_text()

@@ -75,8 +75,7 @@ def test_agrees_with_the_textbook_for_uneven_intervals_and_missing_speeds(seed: 
     yaws = rng.uniform(-math.pi, math.pi, count).tolist()
     speeds = [None if rng.random() < 0.4 else float(rng.uniform(0, 1.5)) for _ in range(count)]
     grounds = [
-        None if s is None else (s * math.cos(yaw), s * math.sin(yaw), 0.0)
-        for s, yaw in zip(speeds, yaws, strict=True)
+        None if s is None else (s * math.cos(yaw), s * math.sin(yaw), 0.0) for s, yaw in zip(speeds, yaws, strict=True)
     ]
     states, covariances = textbook(stamps, accels, grounds, PLAIN)
 

@@ -40,9 +40,7 @@ def body(orientation: rotations.Quaternion, world: Vector) -> Vector:
     return rotations.rotate(rotations.conjugate(orientation), world)
 
 
-def walk(
-    observer: LuenbergerObserver, samples: int, speed: float, orientation: rotations.Quaternion
-) -> PoseEstimate:
+def walk(observer: LuenbergerObserver, samples: int, speed: float, orientation: rotations.Quaternion) -> PoseEstimate:
     """Steady walking: a speed with every IMU sample, no acceleration."""
     for k in range(samples):
         stamp = START_NS + k * PERIOD_NS
@@ -81,9 +79,7 @@ def test_agrees_with_the_matrix_iteration_for_uneven_intervals_and_missing_speed
     accels = [tuple(row) for row in rng.normal(0.0, 2.0, (count, 3)).tolist()]
     yaws = rng.uniform(-math.pi, math.pi, count).tolist()
     scalars = [None if rng.random() < 0.4 else float(rng.uniform(0, 1.5)) for _ in range(count)]
-    observer = LuenbergerObserver(
-        LuenbergerSettings(pole_acceleration=0.3, pole_velocity=0.8), boresight=BORESIGHT
-    )
+    observer = LuenbergerObserver(LuenbergerSettings(pole_acceleration=0.3, pole_velocity=0.8), boresight=BORESIGHT)
 
     got = []
     for stamp, accel, yaw, speed in zip(stamps, accels, yaws, scalars, strict=True):
@@ -93,8 +89,7 @@ def test_agrees_with_the_matrix_iteration_for_uneven_intervals_and_missing_speed
         got.append(observer.imu(stamp, STILL, None, orientation, body(orientation, accel)))
 
     speeds = [
-        None if s is None else (s * math.cos(yaw), s * math.sin(yaw), 0.0)
-        for s, yaw in zip(scalars, yaws, strict=True)
+        None if s is None else (s * math.cos(yaw), s * math.sin(yaw), 0.0) for s, yaw in zip(scalars, yaws, strict=True)
     ]
     velocities, positions = matrix_iteration(stamps, accels, speeds, (0.3, 0.8))
     assert np.array([e.velocity for e in got]) == pytest.approx(velocities, abs=1e-9)
@@ -116,9 +111,7 @@ def test_the_poles_are_the_eigenvalues_of_a_minus_lc(
 
 
 @given(entries=st.tuples(*[st.floats(-2, 2)] * 4), interval=st.floats(0.001, 0.5))
-def test_eigenvalues_of_any_gain_agree_with_numpy(
-    entries: tuple[float, float, float, float], interval: float
-) -> None:
+def test_eigenvalues_of_any_gain_agree_with_numpy(entries: tuple[float, float, float, float], interval: float) -> None:
     gain = (entries[0], entries[1]), (entries[2], entries[3])
     expected = np.linalg.eigvals(np.array([[1.0, 0.0], [interval, 1.0]]) - np.array(gain))
     got = observer_eigenvalues(gain, interval)
@@ -164,9 +157,7 @@ def test_a_constant_speed_is_approached_with_the_velocity_pole() -> None:
 
 @pytest.mark.parametrize("boresight", [BORESIGHT, (1.0, 0.0, 0.0), (0.0, 0.6, -0.8)])
 @pytest.mark.parametrize("yaw_deg", [30.0, -110.0])
-def test_an_open_path_leads_along_the_boresights_yaw_also_without_a_rest(
-    boresight: Vector, yaw_deg: float
-) -> None:
+def test_an_open_path_leads_along_the_boresights_yaw_also_without_a_rest(boresight: Vector, yaw_deg: float) -> None:
     yaw, speed, samples = math.radians(yaw_deg), 0.8, 1001
     observer = LuenbergerObserver(LuenbergerSettings(), boresight=boresight)
     end = walk(observer, samples, speed, held(yaw, boresight=boresight))
@@ -190,9 +181,7 @@ def test_a_rest_is_a_measurement_of_zero_on_all_three_axes() -> None:
     observer = LuenbergerObserver(LuenbergerSettings(), boresight=BORESIGHT)
     orientation = held(1.0)
     for k in range(50):  # no speed yet: the acceleration is integrated
-        moving = observer.imu(
-            START_NS + k * PERIOD_NS, STILL, None, orientation, body(orientation, (1.0, -1.0, 0.5))
-        )
+        moving = observer.imu(START_NS + k * PERIOD_NS, STILL, None, orientation, body(orientation, (1.0, -1.0, 0.5)))
     assert moving.velocity == pytest.approx((0.48, -0.48, 0.24), abs=0.01)
     for k in range(50, 400):
         observer.speed(START_NS + k * PERIOD_NS, 0.0, 0.0, True, 0.32)

@@ -14,9 +14,7 @@ from caneflow.algorithms.moving_returns import (
     RadarParameters,
 )
 
-PARAMETERS = RadarParameters(
-    scan_period=0.01, range_start=0.3, range_step=0.009149, carrier=4.3e9, bandwidth=1.7e9
-)
+PARAMETERS = RadarParameters(scan_period=0.01, range_start=0.3, range_step=0.009149, carrier=4.3e9, bandwidth=1.7e9)
 BINS = 96
 PERIOD = 10_000_000  # ns
 START = 1_700_000_000_000_000_000  # ns
@@ -48,9 +46,7 @@ def test_is_the_analytic_signal_without_the_background() -> None:
 @pytest.mark.parametrize("block", [2, 3, 10, 30])
 def test_frames_of_many_scans_are_the_same_scans(block: int) -> None:
     one, many = fed(SCANS, even(30)), fed(SCANS, even(30), block=block)
-    assert np.concatenate([r.scans for r in many]) == pytest.approx(
-        np.concatenate([r.scans for r in one]), abs=0.01
-    )
+    assert np.concatenate([r.scans for r in many]) == pytest.approx(np.concatenate([r.scans for r in one]), abs=0.01)
     assert [s for r in many for s in r.stamps_ns] == even(30)
     assert not any(r.lost for r in many)
 

@@ -21,9 +21,7 @@ from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 from caneflow.algorithms.rest import RestSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, from_rotation_vector
 
-PARAMETERS = RadarParameters(
-    scan_period=0.01, range_start=0.3, range_step=0.009149, carrier=4.3e9, bandwidth=1.7e9
-)
+PARAMETERS = RadarParameters(scan_period=0.01, range_start=0.3, range_step=0.009149, carrier=4.3e9, bandwidth=1.7e9)
 PERIOD = 10_000_000  # ns
 HEIGHT, DOWN, APERTURE = 0.75, math.radians(42), math.radians(50)
 GEOMETRY = CaneGeometry(hand_height=HEIGHT, aperture=APERTURE, pivot=(0.0, 0.0, 0.0))
@@ -56,9 +54,7 @@ def ground(speed: float, seed: int = 0, count: int = 96, snr_db: float = 15.0) -
         at = np.rint((distance - PARAMETERS.range_start) / PARAMETERS.range_step).astype(int)
         near = at[:, None] + np.arange(-half, half + 1)
         away = PARAMETERS.range_start + near * PARAMETERS.range_step - distance[:, None]
-        echo = np.exp(-0.5 * (away / 0.0426) ** 2) * np.cos(
-            4 * math.pi * PARAMETERS.carrier / SPEED_OF_LIGHT * away
-        )
+        echo = np.exp(-0.5 * (away / 0.0426) ** 2) * np.cos(4 * math.pi * PARAMETERS.carrier / SPEED_OF_LIGHT * away)
         inside = (near >= 0) & (near < len(bins))
         scans[k] = np.bincount(near[inside], (amplitude[:, None] * echo)[inside], minlength=288)
     scans *= 1000 / scans[:, 90:110].std()

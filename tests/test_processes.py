@@ -246,14 +246,10 @@ def test_every_host_and_speed_gives_the_same_bytes(cane: Path, walk: Path, tmp_p
 
 def test_a_replay_keeps_the_recorded_spacing(cane: Path, walk: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    done = caneflow(
-        "run", cane, "--replay", walk, "--speed", "2", "--start", "1", "--duration", "2", "--record", out
-    )
+    done = caneflow("run", cane, "--replay", walk, "--speed", "2", "--start", "1", "--duration", "2", "--record", out)
     assert done.returncode == 0, done.stderr
     with Recording(out) as recording:
-        times = {
-            key: [s.log_time for s in recording.samples([key])] for key in (("imu", "imu"), ("fusion", "pose"))
-        }
+        times = {key: [s.log_time for s in recording.samples([key])] for key in (("imu", "imu"), ("fusion", "pose"))}
         first = next(recording.samples([("imu", "imu")]))
     assert first.stamp == 2_000_000_000
     assert first.seq == 0  # a run counts anew
@@ -300,9 +296,7 @@ def test_ctrl_c_ends_everything_in_order(live: Path, tmp_path: Path, start: Call
 
 
 @pytest.mark.parametrize("wait_for_ready", [True, False])
-def test_a_killed_launcher_leaves_no_process(
-    live: Path, start: Callable[..., Running], wait_for_ready: bool
-) -> None:
+def test_a_killed_launcher_leaves_no_process(live: Path, start: Callable[..., Running], wait_for_ready: bool) -> None:
     running = start("run", live)
     if wait_for_ready:
         with running.session() as session:
@@ -349,9 +343,7 @@ def test_a_node_that_hangs_before_it_is_ready_is_named(
         ECHO.replace('if __name__ == "__main__":', 'if __name__ == "__main__":\n    import time; time.sleep(1000)')
     )
     live.write_text(
-        live.read_text().replace(
-            "restart: {policy: on-failure, delay_s: 0.1}", "restart: never, ready_timeout_s: 2"
-        )
+        live.read_text().replace("restart: {policy: on-failure, delay_s: 0.1}", "restart: never, ready_timeout_s: 2")
     )
     done = caneflow("run", live)
     assert done.returncode == 1

@@ -273,9 +273,7 @@ def test_an_mcap_file_of_something_else_is_refused(tmp_path: Path) -> None:
         schema = other.register_schema("sensor_msgs/Imu", "ros1msg", b"")
         other.add_message(other.register_channel("/imu", "ros1", schema), 0, b"", 0)
         other.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(
-        RecordingError, match="no metadata record 'caneflow' with 'flow'; a recording is an MCAP file"
-    ):
+    with pytest.raises(RecordingError, match="no metadata record 'caneflow' with 'flow'; a recording is an MCAP file"):
         Recording(path)
 
 

@@ -123,9 +123,7 @@ def test_a_file_cut_anywhere_yields_what_came_before_the_cut(
 
 @cuts
 @given(data=st.data())
-def test_a_damaged_byte_is_found_or_harmless(
-    tmp_path: Path, sound: tuple[bytes, Read], data: st.DataObject
-) -> None:
+def test_a_damaged_byte_is_found_or_harmless(tmp_path: Path, sound: tuple[bytes, Read], data: st.DataObject) -> None:
     whole, samples = sound
     at, value = data.draw(st.integers(0, len(whole) - 1)), data.draw(st.integers(0, 255))
     path = tmp_path / "damaged.mcap"

@@ -59,8 +59,7 @@ def test_power_falls_as_the_fourth_power_of_range() -> None:
     antenna, boresight = at_origin(1)
     power = [
         np.sum(
-            np.abs(echoes(antenna, boresight, np.array([[r, 0, 0]]), np.ones(1, complex), RIG.aperture, SETTINGS))
-            ** 2
+            np.abs(echoes(antenna, boresight, np.array([[r, 0, 0]]), np.ones(1, complex), RIG.aperture, SETTINGS)) ** 2
         )
         for r in (0.8, 1.6)
     ]
@@ -166,9 +165,7 @@ def test_the_tip_and_the_coupling_stand_still_at_their_ranges() -> None:
 
 def test_a_sparse_floor_is_as_strong_as_a_dense_one() -> None:
     track = course("loop", 8.0, 3.0, 0.5, 1, False)
-    dense, sparse = (
-        scene(SceneSettings(floor_density=density), track, default_rng(7)) for density in (400.0, 40.0)
-    )
+    dense, sparse = (scene(SceneSettings(floor_density=density), track, default_rng(7)) for density in (400.0, 40.0))
     assert len(dense.points) == pytest.approx(10 * len(sparse.points), rel=0.05)
     ratio = np.sum(np.abs(dense.amplitudes) ** 2) / np.sum(np.abs(sparse.amplitudes) ** 2)
     assert ratio == pytest.approx(1.0, abs=0.1)

@@ -160,9 +160,7 @@ def test_a_picture_may_go_to_a_file(file: Path, tmp_path: Path) -> None:
 def test_svg_without_graphviz_is_one_line(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
 
-    with pytest.raises(
-        DataflowError, match=r"^no `dot` on this machine; install Graphviz, or use --format mermaid$"
-    ):
+    with pytest.raises(DataflowError, match=r"^no `dot` on this machine; install Graphviz, or use --format mermaid$"):
         called(graph, str(file), "--format", "svg")
 
 

@@ -54,9 +54,7 @@ def copied(path: Path, to: Path, *, truth: bool, rig: dict[str, Any] | None = No
     """The recording again, with or without its truth, and with another rig."""
     with (
         Recording(path) as source,
-        RecordingWriter(
-            to, flow=source.flow, source="simulated", rig=source.rig if rig is None else rig
-        ) as writer,
+        RecordingWriter(to, flow=source.flow, source="simulated", rig=source.rig if rig is None else rig) as writer,
     ):
         streams = [name for name in source.streams if truth or name != TRUTH]
         for s in source.samples(streams):
@@ -172,9 +170,7 @@ def test_a_method_that_fails_does_not_stop_the_others(walks: list[Path], tmp_pat
     assert line.startswith(f"{poor}: shs: rig.step_length")
 
 
-def test_an_operator_that_breaks_fails_its_recording_only(
-    walks: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_operator_that_breaks_fails_its_recording_only(walks: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     fusion = load(FLOW).nodes["fusion"].program
     assert fusion is not None
     assert issubclass(fusion, Operator)

@@ -105,9 +105,7 @@ def test_a_track_with_everything_is_drawn(caneflow: Callable[..., Run], tmp_path
     picture = tmp_path / f"track{suffix}"
     status, out, err = caneflow("plot", path, "-o", picture)
     assert (status, err) == (0, "")
-    assert (
-        out == "fusion/pose kalman: final error 0.20 m, ATE 0.12 m, end to start 1.51 m, drift 13.4 % of 1.5 m\n"
-    )
+    assert out == "fusion/pose kalman: final error 0.20 m, ATE 0.12 m, end to start 1.51 m, drift 13.4 % of 1.5 m\n"
     assert picture.stat().st_size > 10_000
 
 

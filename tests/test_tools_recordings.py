@@ -124,9 +124,7 @@ def test_export_of_poses_as_tum(caneflow: Callable[..., Run], track: Path) -> No
 
 
 def test_export_of_samples_as_csv(caneflow: Callable[..., Run], track: Path, tmp_path: Path) -> None:
-    status, out, err = caneflow(
-        "export", track, "--format", "csv", "--stream", "imu/imu", "-o", tmp_path / "imu.csv"
-    )
+    status, out, err = caneflow("export", track, "--format", "csv", "--stream", "imu/imu", "-o", tmp_path / "imu.csv")
     assert (status, out, err) == (0, "", "")
     with (tmp_path / "imu.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -232,18 +230,14 @@ def test_a_log_of_several_radars_is_imported_one_by_one(caneflow: Callable[..., 
     log.write_bytes(radar_log([(source, 10 * i, [source] * 96) for i in range(5) for source in (101, 102)]))
     refused = caneflow("import", "p440", log, "-o", tmp_path / "radar.mcap")
     assert refused == (2, "", f"caneflow import: {log}: scans of 2 radars; choose one with --source: 101, 102\n")
-    assert (
-        "5 scans of 96 samples" in caneflow("import", "p440", log, "--source", 102, "-o", tmp_path / "r.mcap")[1]
-    )
+    assert "5 scans of 96 samples" in caneflow("import", "p440", log, "--source", 102, "-o", tmp_path / "r.mcap")[1]
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [(b"x" * 20, ""), (radar_log([]), "0 complete raw scans; a period takes 2\n"), (b"x" * 2000, "")],
 )
-def test_what_is_no_log_is_one_line(
-    caneflow: Callable[..., Run], tmp_path: Path, content: bytes, said: str
-) -> None:
+def test_what_is_no_log_is_one_line(caneflow: Callable[..., Run], tmp_path: Path, content: bytes, said: str) -> None:
     log = tmp_path / "log.bin"
     log.write_bytes(content)
     status, _, err = caneflow("import", "p440", log, "-o", tmp_path / "radar.mcap")
@@ -286,9 +280,7 @@ def test_the_period_is_finer_than_the_clock_and_survives_losses() -> None:
         ("p440-udp-loss/test_scan2.txt", 100, 46.4),
     ],
 )
-def test_logs_of_real_radars(
-    caneflow: Callable[..., Run], tmp_path: Path, name: str, count: int, rate: float
-) -> None:
+def test_logs_of_real_radars(caneflow: Callable[..., Run], tmp_path: Path, name: str, count: int, rate: float) -> None:
     """Counts and the first rate are those of the data's description; the others follow from the scan durations."""
     log, path = SHARED / "data" / name, tmp_path / "radar.mcap"
     if not log.exists():

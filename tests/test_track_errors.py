@@ -28,9 +28,7 @@ def facing(yaws: Floats, pitch: float = 0.7) -> Floats:
     return np.stack([w * c, w * s, z * s, z * c], axis=1)
 
 
-def track(
-    positions: Floats, yaws: Floats | float = 0.0, step_ns: int = 10_000_000, first_ns: int = START_NS
-) -> Track:
+def track(positions: Floats, yaws: Floats | float = 0.0, step_ns: int = 10_000_000, first_ns: int = START_NS) -> Track:
     positions = np.asarray(positions, dtype=np.float64)
     if positions.shape[1] == 2:
         positions = np.column_stack([positions, np.zeros(len(positions))])
@@ -218,9 +216,7 @@ def test_agrees_with_the_outside_check_to_its_rounding(
 ) -> None:
     truth, whole = wander(seed), wander(seed + 1000)
     part = slice(*cut)
-    estimate = Track(
-        stamps=whole.stamps[part], positions=whole.positions[part], orientations=whole.orientations[part]
-    )
+    estimate = Track(stamps=whole.stamps[part], positions=whole.positions[part], orientations=whole.orientations[part])
 
     def poses(path: str, want_truth: bool) -> tuple[object, object, object]:
         of = truth if want_truth else estimate

@@ -14,9 +14,7 @@ MISTAKEN_STATUS = 1
 
 
 def command(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="The dataflow, e.g. dataflow.yaml.", show_default=False)
-    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The dataflow, e.g. dataflow.yaml.", show_default=False)],
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting (may be given again)."),

@@ -52,9 +52,7 @@ def command(
         typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting (may be given again)."),
     ] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="How many recordings at a time.")] = 1,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object: method, recording, figure.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object: method, recording, figure.")] = False,
     csv_file: Annotated[
         Path | None,
         typer.Option("--csv", metavar="FILE", help="Write a row per method and recording as well."),

@@ -73,9 +73,7 @@ EXPERIMENTS = {
         "The paper's distance between end and start means nothing on it.",
         closed=False,
     ),
-    "figure_eight": Experiment(
-        title="Figure eight", about="8 x 3 m: errors of left turns meet those of right turns."
-    ),
+    "figure_eight": Experiment(title="Figure eight", about="8 x 3 m: errors of left turns meet those of right turns."),
     "slow": Experiment(title="A quarter of a metre per second", about="The same loop at 0.25 m/s."),
     "brisk": Experiment(
         title="1 m/s",
@@ -178,9 +176,7 @@ def draw(
     if ONE_WALK in results and pictured:
         _draw_tracks(pyplot, results[ONE_WALK], pictured, folder / "results_tracks.png")
         names = " and ".join(_name(method) for method in pictured)
-        drawn["tracks"] = (
-            f"![Tracks of the swing walks by {names}, the truth in grey](pictures/results_tracks.png)"
-        )
+        drawn["tracks"] = f"![Tracks of the swing walks by {names}, the truth in grey](pictures/results_tracks.png)"
     _draw_errors(pyplot, results, methods, folder / "results_errors.png")
     drawn["errors"] = "![Final error of every walk, by experiment and method](pictures/results_errors.png)"
     return drawn
@@ -220,9 +216,7 @@ def _evaluations(flow: Path, paths: Sequence[Path], methods: Sequence[str], jobs
     drawn = [path for path in paths if path.stem.rpartition("_")[0] == ONE_WALK]
     others = [path for path in paths if path not in drawn]
     done = [
-        *_shown(
-            evaluated(flow, drawn, methods, jobs=jobs, keep_tracks=True), f"evaluating {ONE_WALK}", len(drawn)
-        ),
+        *_shown(evaluated(flow, drawn, methods, jobs=jobs, keep_tracks=True), f"evaluating {ONE_WALK}", len(drawn)),
         *_shown(evaluated(flow, others, methods, jobs=jobs), "evaluating", len(others)),
     ]
     return {each.recording: each for each in done}
@@ -401,9 +395,7 @@ def _draw_tracks(pyplot: Any, evaluations: Sequence[Evaluation], methods: Sequen
     _save(pyplot, figure, path)
 
 
-def _draw_errors(
-    pyplot: Any, results: Mapping[str, Sequence[Evaluation]], methods: Sequence[str], path: Path
-) -> None:
+def _draw_errors(pyplot: Any, results: Mapping[str, Sequence[Evaluation]], methods: Sequence[str], path: Path) -> None:
     """The end error of every walk as a dot, their mean as a bar, on a logarithmic axis."""
     figure, panel = pyplot.subplots(figsize=(1.6 + 0.95 * len(results), 4.2))
     for m, method in enumerate(methods):

@@ -90,18 +90,14 @@ def _chosen(source: Recording, form: Format, stream: str | None) -> Stream:
             raise RecordingError(f"{source.path}: {stream} holds {chosen.schema}; tum takes {Pose.schema}")
         return chosen
     there = [
-        each
-        for each in source.streams.values()
-        if each.count and (form is Format.CSV or each.schema == Pose.schema)
+        each for each in source.streams.values() if each.count and (form is Format.CSV or each.schema == Pose.schema)
     ]
     fitting = [each for each in there if (each.node, each.port) != TRUTH]
     if len(fitting) != 1:
         kind = "stream of poses" if form is Format.TUM else "stream with samples"
         names = ", ".join(f"{each.node}/{each.port}" for each in there)
         raise RecordingError(
-            f"{source.path}: choose what to write with --stream: {names}"
-            if there
-            else f"{source.path}: has no {kind}"
+            f"{source.path}: choose what to write with --stream: {names}" if there else f"{source.path}: has no {kind}"
         )
     return fitting[0]
 

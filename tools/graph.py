@@ -19,9 +19,7 @@ DRAW: dict[str, Callable[[Graph], str]] = {
 
 
 def command(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="The dataflow, e.g. dataflow.yaml.", show_default=False)
-    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The dataflow, e.g. dataflow.yaml.", show_default=False)],
     kind: Annotated[
         Literal["mermaid", "svg", "json"],
         typer.Option(

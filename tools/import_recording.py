@@ -57,9 +57,7 @@ def p440(
                 bandwidth=bandwidth,
             )
             writer.write(key, RadarFrame, numbered(frame, seq), stamp=stamp, seq=seq, log_time=stamp)
-    print(
-        f"{output}: {len(scans)} scans of {len(scans[0].samples)} samples, {1 / period:.2f} Hz, {_losses(parsed)}"
-    )
+    print(f"{output}: {len(scans)} scans of {len(scans[0].samples)} samples, {1 / period:.2f} Hz, {_losses(parsed)}")
 
 
 def stamps_of(timestamps_ms: Sequence[int]) -> list[int]:

@@ -90,9 +90,7 @@ class Picture:
 
 def command(
     recording: Annotated[Path, typer.Argument(metavar="REC", help="Recording to draw.", show_default=False)],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help=f"{', '.join(SUFFIXES)} to write.")
-    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help=f"{', '.join(SUFFIXES)} to write.")],
 ) -> None:
     """Draw a recording's track against the truth, its speed, its error over time and the radar's Doppler.
 

@@ -36,9 +36,7 @@ def command(
     in_process: Annotated[
         bool, typer.Option("--in-process", help="all nodes in this process, as fast as the processor allows")
     ] = False,
-    record: Annotated[
-        Path | None, typer.Option(metavar="OUT", help="write every stream to this recording")
-    ] = None,
+    record: Annotated[Path | None, typer.Option(metavar="OUT", help="write every stream to this recording")] = None,
     rig: Annotated[
         Path | None, typer.Option(metavar="YAML", help="a rig to lay over the recording's and the file's")
     ] = None,

@@ -31,9 +31,7 @@ def walk(
     Example: caneflow simulate walk --scenario stops --seed 3 -o stops_3.mcap
     """
     if scenario not in SCENARIOS:
-        raise typer.BadParameter(
-            f"no walk {scenario!r}; there are {', '.join(SCENARIOS)}", param_hint="--scenario"
-        )
+        raise typer.BadParameter(f"no walk {scenario!r}; there are {', '.join(SCENARIOS)}", param_hint="--scenario")
     require_writable(output)
     with progress_bar(f"{scenario}, seed {seed}") as progress:
         walked = simulate_walk(scenario, seed, duration, progress)

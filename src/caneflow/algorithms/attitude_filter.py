@@ -87,9 +87,7 @@ class AttitudeFilter:
         """rad/s, standard deviation of the gyro's bias per axis of the body."""
         return self._bias.sd
 
-    def update(
-        self, stamp_ns: int, gyro: Vector, accel: Vector | None, mag: Vector | None = None
-    ) -> AttitudeEstimate:
+    def update(self, stamp_ns: int, gyro: Vector, accel: Vector | None, mag: Vector | None = None) -> AttitudeEstimate:
         """The estimate at `stamp_ns` from a reading in the body frame: rad/s, m/s^2, any unit.
 
         Raises ValueError when time does not go on, or for a first reading without `accel`.
@@ -147,7 +145,9 @@ class AttitudeFilter:
                 tilt = 2.0 * correction[1], 2.0 * correction[2]
         if mag is not None:
             row = vertical_row(attitude, self._bias.bias)
-            turn = self._heading.update(rotate(attitude, mag), row, gyro, self._since_field)
+            turn = self._heading.update(
+                rotate(attitude, mag), row, gyro, self._since_field, levelled=self._gravity.levelled
+            )
             self._since_field = 0.0
         if interval > 0.0:
             self._learn_bias(gyro, accel, tilt, turn, interval)
@@ -184,6 +184,11 @@ class _Gravity:
         self._twice: Vector = (0.0, 0.0, 0.0)
         self._rows_once = self.rows = (NOTHING_SEEN, NOTHING_SEEN)
         self._elapsed = 0.0  # s
+
+    @property
+    def levelled(self) -> bool:
+        """Whether most of an error of the start is gone."""
+        return self._elapsed > 2.0 * self._time_constant
 
     @property
     def settled(self) -> bool:

@@ -9,7 +9,7 @@ cells share (cane.md, "Pulse pair").
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from caneflow.algorithms.attitude_history import AttitudeHistory
 from caneflow.algorithms.footprint import CaneGeometry, antenna_height, pitch
 from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT, speed_limit
+from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 
 Floats = NDArray[np.float64]
 UNOBSERVED: Final = 1e6  # (m/s)^2, variance of a component that is not observed (wire.md)
@@ -146,7 +146,12 @@ class GroundVelocityEstimator:
         self._geometry = geometry
         self._window = PulsePairWindow(window=settings.window, cell=settings.cell)
         self.debug = None
-        self.dh=0.0; self.Ph=0.03**2; self.usevz=True; self.useh=True; self.sdz=0.02; self.corr=50.
+        self.dh = 0.0
+        self.Ph = 0.03**2
+        self.usevz = True
+        self.useh = True
+        self.sdz = 0.02
+        self.corr = 50.0
 
     def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> VelocityEstimate:
         settings = self._settings
@@ -166,9 +171,10 @@ class GroundVelocityEstimator:
         geometry = self._geometry
         height = antenna_height(geometry, orientation)
         axis = pitch(geometry, orientation)
-        hz, hv = self.heave.at((oldest_ns+newest_ns)//2)
+        hz, hv = self.heave.at((oldest_ns + newest_ns) // 2)
         rise = hv if self.usevz else (antenna_height(geometry, after) - antenna_height(geometry, before)) / (2 * delay)
-        if self.usevz: height = hz
+        if self.usevz:
+            height = hz
         height += self.dh
         sums = self._window.sums()
         sine = height / sums.ranges
@@ -189,12 +195,14 @@ class GroundVelocityEstimator:
         phase = np.angle(pairs * np.exp(-1j * vertical * rise))
         weight = np.where(coherence > settings.least_coherence, coherence**2 / (1 - coherence**2), 0.0)
         weight = np.minimum(weight, 30)
-        self.debug = dict(coh=coherence_all, rate=rate, n=int((weight > 0).sum()), tot=total/len(pairs))
+        self.debug = dict(coh=coherence_all, rate=rate, n=int((weight > 0).sum()), tot=total / len(pairs))
         if (weight > 0).sum() < settings.fewest_cells:
             return _nothing(delay)
         # start: weighted median of per-cell speeds
         v = phase / forward
-        o = np.argsort(v); cw = np.cumsum((weight*forward**2)[o]); vf = v[o][np.searchsorted(cw, 0.5 * cw[-1])]
+        o = np.argsort(v)
+        cw = np.cumsum((weight * forward**2)[o])
+        vf = v[o][np.searchsorted(cw, 0.5 * cw[-1])]
         vz = dh = 0.0
         pz = 1.0 / self.sdz**2
         ph = 1.0 / self.Ph
@@ -202,25 +210,28 @@ class GroundVelocityEstimator:
         slope = slope * beam_factor(grazing, axis, geometry.aperture)
         for _ in range(4):
             cols = np.stack([forward, vertical, slope * vf])
-            r = phase - vf * forward - vz * vertical - 0*dh * slope * vf
+            r = phase - vf * forward - vz * vertical - 0 * dh * slope * vf
             w = weight / (1 + (r / settings.outlier) ** 2) ** 2 * 2
-            N = np.einsum('ik,k,jk->ij', cols, w, cols)
-            y = np.einsum('ik,k,k->i', cols, w, phase)
-            N[1,1] += pz; N[2,2] += ph
+            N = np.einsum("ik,k,jk->ij", cols, w, cols)
+            y = np.einsum("ik,k,k->i", cols, w, phase)
+            N[1, 1] += pz
+            N[2, 2] += ph
             vf, vz, dh = np.linalg.solve(N, y).tolist()
-            if not self.useh: dh = 0.0
+            if not self.useh:
+                dh = 0.0
         C = np.linalg.inv(N)
-        r = phase - forward * vf - vertical * vz - slope*vf*dh
+        r = phase - forward * vf - vertical * vz - slope * vf * dh
         s2 = float((w * r * r).sum() / max(w.sum(), 1e-9))
-        var = float(C[0,0])
+        var = float(C[0, 0])
         if self.useh:
-            info = max(1/C[2,2]-ph, 0)/self.corr
-            self.Ph += 0.002**2*period
-            K = info and self.Ph*info/(1+self.Ph*info)
+            info = max(1 / C[2, 2] - ph, 0) / self.corr
+            self.Ph += 0.002**2 * period
+            K = info and self.Ph * info / (1 + self.Ph * info)
             # dh is the posterior mean with prior 0 of sd Ph; data-only value
-            data = dh*(1/C[2,2])/max(1/C[2,2]-ph,1e-9) if info else 0.
-            self.dh += K*data; self.Ph *= (1-K)
-        fit = float((np.abs(pairs)*np.cos(r)).sum())/total
+            data = dh * (1 / C[2, 2]) / max(1 / C[2, 2] - ph, 1e-9) if info else 0.0
+            self.dh += K * data
+            self.Ph *= 1 - K
+        fit = float((np.abs(pairs) * np.cos(r)).sum()) / total
         self.debug.update(coh2=fit, vz=vz + rise, s2=s2, var=var, W=float(w.sum()), dh=self.dh)
         return VelocityEstimate(velocity=(vf, 0.0), covariance=(var, 0.0, UNOBSERVED), delay=delay, valid=True)
 

@@ -34,9 +34,7 @@ class GyroBiasSettings:
     walk: Annotated[float, Gt(0)] = math.radians(0.01)  # rad/s/sqrt(s): 0.1 deg/s in 100 s
     # sd of a measurement over 1 s:
     rest_noise: Annotated[float, Gt(0)] = math.radians(0.05)  # rad/s, at rest, beside what follows
-    sway: Annotated[float, Ge(0)] = (
-        4.0  # times the gyro's own deviations at rest: a hand that is still is not quite
-    )
+    sway: Annotated[float, Ge(0)] = 4.0  # times the gyro's own deviations at rest: a hand that is still is not quite
     tilt_noise: Annotated[float, Gt(0)] = math.radians(1.0)  # rad/s, of a correction by gravity
     heading_noise: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/s, of a correction by magnetic north
     rest_gyro: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/s, largest deviation from the mean at rest

@@ -145,7 +145,11 @@ class HeadingHypotheses:
         residual = self._fields[n] - self._fields[0] + self.headings(self._times[n], self._turns[n])
         apart = np.abs(self._at[:, :n] - self._at[:, n : n + 1])
         wide = s.field_scale**2 + self._variances[n] - np.array(self._variances[:n])
-        kernel = s.field_error**2 * (s.field_scale**2 / wide) * np.exp(-0.5 * apart**2 / wide) + s.rough_error**2 * np.exp(-apart / s.rough_scale) + 1.0
+        kernel = (
+            s.field_error**2 * (s.field_scale**2 / wide) * np.exp(-0.5 * apart**2 / wide)
+            + s.rough_error**2 * np.exp(-apart / s.rough_scale)
+            + 1.0
+        )
         inverse = self._inverse[:, :n, :n]
         w = np.einsum("hij,hj->hi", inverse, kernel)
         own = s.field_error**2 + s.rough_error**2 + 1.0 + s.field_noise**2

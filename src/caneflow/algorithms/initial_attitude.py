@@ -26,9 +26,7 @@ class AttitudeMethod(Protocol):
     def gaps(self) -> int:
         """How many intervals between samples were too long to integrate over."""
 
-    def update(
-        self, stamp_ns: int, gyro: Vector, accel: Vector | None, mag: Vector | None = None
-    ) -> AttitudeEstimate:
+    def update(self, stamp_ns: int, gyro: Vector, accel: Vector | None, mag: Vector | None = None) -> AttitudeEstimate:
         """The estimate at `stamp_ns`: rad/s, specific force in m/s^2, uT (any scale), all in the body frame."""
 
 
@@ -41,12 +39,12 @@ def level(up: Vector) -> Quaternion:
     norm = math.sqrt(x * x + y * y + z * z)
     if not norm > SHORTEST_VECTOR:  # written so that NaN is refused
         raise ValueError(f"a specific force of {norm:.3g} m/s^2 does not tell what is up")
-    w = norm + z
-    if w < 1e-6 * norm:  # upside down: every horizontal axis is as short
+    # half-way quaternion (|up| + up.z, up x z), normalised; the sum written so that it keeps its digits
+    w = norm + z if z > 0.0 else (x * x + y * y) / (norm - z)
+    length = math.sqrt(w * w + x * x + y * y)
+    if length < 1e-150 + 1e-15 * norm:  # upside down: every horizontal axis is as short
         return 0.0, 1.0, 0.0, 0.0
-    # half-way quaternion (|up| + up.z, up x z), normalised
-    scale = 1.0 / math.sqrt(w * w + x * x + y * y)
-    return scale * w, scale * y, -scale * x, 0.0
+    return w / length, y / length, -x / length, 0.0
 
 
 def initial_attitude(accel: Vector, mag: Vector | None = None) -> Quaternion:

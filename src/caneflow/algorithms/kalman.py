@@ -216,9 +216,7 @@ class KalmanFilter:
             step = 0.0
             self._axis.forget(interval)
         else:
-            self._axis.predict(
-                interval, settings.acceleration_walk**2 * interval, settings.velocity_walk**2 * interval
-            )
+            self._axis.predict(interval, settings.acceleration_walk**2 * interval, settings.velocity_walk**2 * interval)
         ax, ay, az = self._acceleration
         vx, vy, vz = self._velocity
         vx, vy, vz = vx + step * ax, vy + step * ay, vz + step * az

@@ -44,8 +44,7 @@ class LuenbergerSettings:
             if not all(abs(value) < 1.0 for value in eigenvalues):
                 listed = ", ".join(f"{value:.4g}" for value in eigenvalues)
                 raise ValueError(
-                    f"gain: A - L C has eigenvalues {listed} at {self.interval} s; "
-                    "all must lie inside the unit circle"
+                    f"gain: A - L C has eigenvalues {listed} at {self.interval} s; all must lie inside the unit circle"
                 )
 
 
@@ -119,9 +118,7 @@ class LuenbergerObserver:
     def _advance(self, stamp_ns: int, interval: float) -> None:
         step = interval if interval <= LONGEST_INTERVAL else 0.0  # T in A
         measurement = self._ground.take(stamp_ns)
-        gain = self._settings.gain or placed_gain(
-            step, self._settings.pole_acceleration, self._settings.pole_velocity
-        )
+        gain = self._settings.gain or placed_gain(step, self._settings.pole_acceleration, self._settings.pole_velocity)
         ax, ay, az = self._acceleration
         vx, vy, vz = self._velocity
         px, py, pz = self._position

@@ -42,9 +42,7 @@ class Madgwick:
         """How many intervals were longer than LONGEST_INTERVAL; the gyro is not integrated over them."""
         return self._clock.gaps
 
-    def update(
-        self, stamp_ns: int, gyro: Vector, accel: Vector | None, mag: Vector | None = None
-    ) -> AttitudeEstimate:
+    def update(self, stamp_ns: int, gyro: Vector, accel: Vector | None, mag: Vector | None = None) -> AttitudeEstimate:
         """The estimate at `stamp_ns` from a reading in the body frame: rad/s, m/s^2, any unit.
 
         Without `accel` the gyro alone goes on; without `mag` nothing corrects the yaw.

@@ -19,6 +19,7 @@ SMOOTHING = 0.1  # s, of strength and dip: the magnetometer's noise is no distur
 TURNING = math.radians(20.0)  # rad/s; a field that is steady while the body turns is no magnet that it carries
 LARGEST_DISTRUST = 1000.0
 SETTLED = 1.5  # times the steady variance, below which corrections are of now, not of what was
+LEVELLING_MEMORY = 2.0  # s of readings that count before the attitude is level
 LEAST_LEVEL = 1e-3  # of the field's strength; a field as steep as that has no yaw
 
 
@@ -119,7 +120,9 @@ class MagneticHeading:
         self._variance = math.inf  # s, see above
         self.row: Row = NOTHING_SEEN  # what the corrections tell of the gyro's bias
 
-    def update(self, magnetic: Vector, row: Row, gyro: Vector, interval: float) -> float | None:
+    def update(
+        self, magnetic: Vector, row: Row, gyro: Vector, interval: float, *, levelled: bool = True
+    ) -> float | None:
         """Correct the offset by a field, turned level by the gyro's attitude, `interval` s after the one before.
 
         Args:
@@ -127,6 +130,7 @@ class MagneticHeading:
             row: the vertical one of the attitude, see gyro_bias.
             gyro: rad/s.
             interval: s since the reading before.
+            levelled: false while the attitude's inclination may be wrong, and with it the yaw of a dipping field.
 
         Returns:
             The correction in rad, where it tells of the gyro's bias: not at the start, nor near a disturbance.
@@ -140,7 +144,10 @@ class MagneticHeading:
         turn_rate = math.sqrt(gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2])
         self._deviation = self._reference.deviation(strength, math.atan2(-up, level), turn_rate, interval)
         distrust = min(1.0 + 10.0 * self._deviation**4, LARGEST_DISTRUST)
-        gain = self._gain(distrust * self._settings.time_constant**2, interval)
+        noise = distrust * self._settings.time_constant**2
+        gain = self._gain(noise, interval)
+        if not levelled:
+            self._variance = max(self._variance, noise / LEVELLING_MEMORY)
         turn = gain * wrapped(NORTH_YAW - math.atan2(north, east) - self.offset)
         self.offset = wrapped(self.offset + turn)
         self.row = followed_row(self.row, row, gain)

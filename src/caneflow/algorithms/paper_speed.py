@@ -157,9 +157,7 @@ class PaperSpeed:
         summed += power[2:]
         return summed
 
-    def _has_come_round(
-        self, spectrum: NDArray[np.float32], approaching: float, receding: float, floor: float
-    ) -> bool:
+    def _has_come_round(self, spectrum: NDArray[np.float32], approaching: float, receding: float, floor: float) -> bool:
         """Whether ground recedes, or approaches so fast that some of its Doppler shows on the other side."""
         half = len(spectrum) // 2
         stands_out = receding > self._settings.least_peak * floor and receding > RECEDING_SHARE * approaching

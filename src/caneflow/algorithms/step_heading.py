@@ -24,8 +24,7 @@ class StepHeadingSettings:
     def __post_init__(self) -> None:
         if not self.swing_rate > self.stationary_rate:
             raise ValueError(
-                f"swing_rate is {self.swing_rate} rad/s; it must be above stationary_rate, "
-                f"{self.stationary_rate} rad/s"
+                f"swing_rate is {self.swing_rate} rad/s; it must be above stationary_rate, {self.stationary_rate} rad/s"
             )
 
 

@@ -29,9 +29,7 @@ class TrackErrors:
     final_distance: float  # m, end to start of the estimate: the paper's error, for closed walks
     final_error: float  # m, end of the estimate to end of the truth
     ate: float  # m, root mean square distance to the truth
-    rpe: (
-        float | None
-    )  # m, root mean square error of the displacement over RELATIVE_LENGTH, heading at its start given
+    rpe: float | None  # m, root mean square error of the displacement over RELATIVE_LENGTH, heading at its start given
     drift_percent: float | None  # final_error in % of length
     path_length_ratio: float | None  # length of the estimate's path over that of the truth: shows a constant scale
     extent: float | None  # longer side of the estimate's bounding box over that of the truth

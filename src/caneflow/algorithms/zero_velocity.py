@@ -51,9 +51,7 @@ class ZeroVelocitySettings:
 
     stance: StanceSettings = StanceSettings()
     velocity_noise: Annotated[float, Gt(0)] = 0.01  # m/s/sqrt(Hz), of a standing foot, which still rolls a little
-    rest_time: Annotated[float, Gt(0)] = (
-        1.0  # s; a stance that lasts longer is no step: the foot does not turn either
-    )
+    rest_time: Annotated[float, Gt(0)] = 1.0  # s; a stance that lasts longer is no step: the foot does not turn either
     turn_noise: Annotated[float, Gt(0)] = math.radians(0.05)  # rad/s/sqrt(Hz), of a foot at rest
     accel_noise: Annotated[float, Gt(0)] = 0.02  # m/s^2/sqrt(Hz); with what a foot adds: scale, bandwidth, impacts
     gyro_noise: Annotated[float, Gt(0)] = math.radians(0.02)  # rad/s/sqrt(Hz), likewise

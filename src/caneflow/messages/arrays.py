@@ -63,7 +63,5 @@ def from_bytes(data: memoryview) -> Array:
     shape = struct.unpack_from(f"<{dimensions}I", data, 2)
     expected = math.prod(shape) * dtype.itemsize
     if len(data) - offset != expected:
-        raise MessageError(
-            f"array of shape {shape} and dtype {dtype} has {len(data) - offset} bytes, not {expected}"
-        )
+        raise MessageError(f"array of shape {shape} and dtype {dtype} has {len(data) - offset} bytes, not {expected}")
     return np.frombuffer(data, dtype, offset=offset).reshape(shape)

@@ -59,9 +59,7 @@ def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
             "title": getattr(kind, "schema", kind.__name__),
         }
     )
-    if issubclass(
-        kind, Sample
-    ):  # the host gives the number, so the class has a default; on the wire it must be there
+    if issubclass(kind, Sample):  # the host gives the number, so the class has a default; on the wire it must be there
         schema["properties"] = {
             **schema["properties"],
             "seq": {

@@ -43,9 +43,7 @@ class Imu(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
     gyro: Annotated[Vector3, Meta(description="rad/s, body")]
     accel: Annotated[Vector3 | None, Meta(description="m/s^2, specific force, body (rest: +9.81 on z)")] = None
     mag: Annotated[Vector3 | None, Meta(description="uT, body")] = None
-    orientation: Annotated[
-        Quaternion | None, Meta(description="w x y z, body to world, the chip's own fusion")
-    ] = None
+    orientation: Annotated[Quaternion | None, Meta(description="w x y z, body to world, the chip's own fusion")] = None
     linear_accel: Annotated[Vector3 | None, Meta(description="m/s^2, body, gravity removed")] = None
     calibration: Annotated[
         tuple[Count, Count, Count, Count] | None,
@@ -102,9 +100,9 @@ class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fals
     velocity: Annotated[
         Vector2 | None, Meta(description="m/s horizontal: along the boresight's projection, to its left")
     ] = None
-    velocity_cov: Annotated[
-        Vector3 | None, Meta(description="xx, xy, yy of velocity, m^2/s^2; 1e6: not observed")
-    ] = None
+    velocity_cov: Annotated[Vector3 | None, Meta(description="xx, xy, yy of velocity, m^2/s^2; 1e6: not observed")] = (
+        None
+    )
     velocity_delay: Annotated[float | None, Meta(description="s by which velocity lags the stamp")] = None
 
     def __post_init__(self) -> None:

@@ -131,8 +131,7 @@ class RecordingWriter:
             with suppress(OSError):  # closing flushes, which fails for the same reason
                 self._file.close()
             raise RecordingError(
-                f"{self.path}: {error.strerror or error}; the recording ends here, "
-                "what was written before can be read"
+                f"{self.path}: {error.strerror or error}; the recording ends here, what was written before can be read"
             ) from error
 
 

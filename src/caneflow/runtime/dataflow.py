@@ -183,9 +183,7 @@ def _lay_over(document: Document, override: str) -> None:
     node, *keys = way.split(".")
     nodes = document.value.get("nodes")
     if not equals or not keys or not all((node, *keys)) or len(keys) > MAX_DEPTH:
-        document.problems.append(
-            Problem(place=place, path="", text="is not NODE.KEY=VALUE, e.g. fusion.method=kalman")
-        )
+        document.problems.append(Problem(place=place, path="", text="is not NODE.KEY=VALUE, e.g. fusion.method=kalman"))
     elif isinstance(nodes, dict) and node not in nodes:
         said = f"no node {shown(node)};{did_you_mean(node, nodes)} there are {listed(nodes)}"
         document.problems.append(Problem(place=place, path="", text=said))

@@ -218,9 +218,7 @@ def _recorder(
     graph: Graph, plans: dict[str, NodePlan], record: Path, replay: Replay | None, rig: dict[str, Any]
 ) -> NodePlan:
     if RECORDER in plans:
-        raise DataflowError(
-            f"{graph.path}: nodes.{RECORDER}: --record adds a node of that name; call yours otherwise"
-        )
+        raise DataflowError(f"{graph.path}: nodes.{RECORDER}: --record adds a node of that name; call yours otherwise")
     inputs = {
         f"{plan.node}/{port}": InputPlan(key=out.key, schema=out.schema, writer=plan.node)
         for plan in plans.values()

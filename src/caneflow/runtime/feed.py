@@ -52,9 +52,7 @@ class Feed:
             self.refused += 1
             if self.refused == 1:
                 stamps = f"stamp {sample.stamp} after {departures.last_stamp}"
-                log.warning(
-                    "%s: not sent, time goes backwards: %s (counted from now on)", departures.plan.key, stamps
-                )
+                log.warning("%s: not sent, time goes backwards: %s (counted from now on)", departures.plan.key, stamps)
             return None
         if isinstance(sample, Encoded):
             if sample.seq == departures.sent:

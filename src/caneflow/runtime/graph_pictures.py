@@ -49,8 +49,7 @@ def as_mermaid(graph: Graph) -> str:
             inside = [f"    subgraph machine_{machine}[{machine}]", *(f"    {line}" for line in inside), "    end"]
         lines += inside
     lines += [
-        f'    node_{wire.node} -- "{_label(wire.port, wire.kind)}" --> node_{reader}'
-        for reader, _, wire in graph.wires
+        f'    node_{wire.node} -- "{_label(wire.port, wire.kind)}" --> node_{reader}' for reader, _, wire in graph.wires
     ]
     return "\n".join(lines) + "\n"
 
@@ -65,8 +64,7 @@ def as_dot(graph: Graph) -> str:
             inside = [head, *(f"  {line}" for line in inside), "  }"]
         lines += inside
     lines += [
-        f'  "{wire.node}" -> "{reader}" [label="{_label(wire.port, wire.kind)}"];'
-        for reader, _, wire in graph.wires
+        f'  "{wire.node}" -> "{reader}" [label="{_label(wire.port, wire.kind)}"];' for reader, _, wire in graph.wires
     ]
     return "\n".join([*lines, "}"]) + "\n"
 

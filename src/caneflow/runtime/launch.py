@@ -202,9 +202,7 @@ class Launcher:
     def _take_exit(self, node: NodeState, exited: Exited) -> None:
         if exited.pid != node.pid:
             return
-        cause = (
-            f"killed by {signal.Signals(-exited.status).name}" if exited.status < 0 else f"status {exited.status}"
-        )
+        cause = f"killed by {signal.Signals(-exited.status).name}" if exited.status < 0 else f"status {exited.status}"
         self._restart_or_fail(node, f"ended with {cause}")
 
     def _restart_or_fail(self, node: NodeState, cause: str) -> None:

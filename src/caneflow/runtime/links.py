@@ -48,9 +48,7 @@ def open_session(
         "scouting/gossip/enabled": False,
         "open/return_conditions/connect_scouted": False,
         "transport/link/tx/lease": REPLAY_LEASE if replay else LIVE_LEASE,
-        "transport/link/tx/queue/size": {
-            priority: BATCHES if priority == "data" else 2 for priority in PRIORITIES
-        },
+        "transport/link/tx/queue/size": {priority: BATCHES if priority == "data" else 2 for priority in PRIORITIES},
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE,
     }

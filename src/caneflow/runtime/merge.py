@@ -61,8 +61,7 @@ class Merge:
     def handled(self) -> int:
         """Up to which stamp (ns) everything has come and has been handed on."""
         return min(
-            (queue[0].stamp - 1 if queue else mark)
-            for queue, mark in zip(self._queues, self._watermarks, strict=True)
+            (queue[0].stamp - 1 if queue else mark) for queue, mark in zip(self._queues, self._watermarks, strict=True)
         )
 
     def _first(self) -> int | None:

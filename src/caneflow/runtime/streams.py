@@ -89,9 +89,7 @@ class Arrivals:
             self.counts.lost += count
             self._say_once("lost", f"{count} samples lost before seq {before}")
             self.left_out.append(
-                LeftOut(
-                    node=self.node, port=self.port, reason="lost", first_seq=self.expected, last_seq=before - 1
-                )
+                LeftOut(node=self.node, port=self.port, reason="lost", first_seq=self.expected, last_seq=before - 1)
             )
 
     def _say_once(self, kind: str, text: str) -> None:

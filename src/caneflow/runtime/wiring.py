@@ -97,9 +97,7 @@ def _takes(document: Document, parts: Mapping[str, Part], name: str, port: str, 
     takes = inputs.get(port, inputs.get(ANY_PORT))
     if takes is None:
         has = f"its inputs are {listed(inputs)}" if inputs else "it reads nothing"
-        document.problem(
-            path, f"{part.shape.run} has no input {port!r};{did_you_mean(port, inputs)} {has}", key=True
-        )
+        document.problem(path, f"{part.shape.run} has no input {port!r};{did_you_mean(port, inputs)} {has}", key=True)
         return False
     if kind is not None and not issubclass(kind, takes):
         document.problem(

@@ -116,9 +116,7 @@ def compose(text: str, source: str) -> Document:
         said = error.problem if error.problem is not None else error.context
         raise _broken(place, f"is no YAML: {one_line(said)}{_advice(one_line(said))}") from error
     except ReaderError as error:
-        place = Place(
-            source=source, line=text.count("\n", 0, error.position) + 1, column=_column(text, error.position)
-        )
+        place = Place(source=source, line=text.count("\n", 0, error.position) + 1, column=_column(text, error.position))
         raise _broken(place, f"is no YAML: character {ord(text[error.position]):#06x} is not allowed") from error
     except RecursionError as error:
         raise _broken(Place(source=source, line=1, column=1), f"is nested more than {MAX_DEPTH} deep") from error

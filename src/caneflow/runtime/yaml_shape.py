@@ -62,9 +62,9 @@ class InputShape(Shape):
 class RestartShape(Shape):
     """What becomes of a node whose process ends."""
 
-    policy: Annotated[
-        Policy, Field(description="start it again never, when it failed, or whenever it has ended")
-    ] = "on-failure"
+    policy: Annotated[Policy, Field(description="start it again never, when it failed, or whenever it has ended")] = (
+        "on-failure"
+    )
     max_restarts: Annotated[
         int, Field(ge=1, le=1000, description="restarts within `window_s` until it is given up")
     ] = 10
@@ -159,16 +159,10 @@ class FlowShape(Shape):
             description=f"first part of every key: {NAME_RULE}",
         ),
     ]
-    seed: Annotated[
-        int, Field(ge=0, le=2**32 - 1, description="where all random numbers of the flow come from")
-    ] = 0
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="where all random numbers of the flow come from")] = 0
     rig: Annotated[Rig, Field(default_factory=Rig, description="what is bolted on")]
-    machines: Annotated[
-        dict[Name, MachineShape], Field(description="when the flow runs on several computers")
-    ] = {}
-    nodes: Annotated[
-        dict[Name, NodeShape], Field(default_factory=dict, description="the programs and their wires")
-    ]
+    machines: Annotated[dict[Name, MachineShape], Field(description="when the flow runs on several computers")] = {}
+    nodes: Annotated[dict[Name, NodeShape], Field(default_factory=dict, description="the programs and their wires")]
     results: Annotated[
         list[Stream], Field(description="outputs that are for people and recordings: no node has to read them")
     ] = []

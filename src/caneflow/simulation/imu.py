@@ -77,9 +77,7 @@ def measure(motion: Motion, settings: ImuSettings, rng: Generator) -> ImuSamples
     count = len(orientation)
     rate = _low_passed(motion.rate, _GYRO_BAND)[::_EVERY]
     gyro = _gyro(rate, settings, gyro_rng)
-    force = attitude.rotate(
-        attitude.conjugate(motion.orientation), motion.acceleration + np.array([0.0, 0.0, GRAVITY])
-    )
+    force = attitude.rotate(attitude.conjugate(motion.orientation), motion.acceleration + np.array([0.0, 0.0, GRAVITY]))
     accel = _accel(_low_passed(force, _ACCEL_BAND)[::_EVERY], settings, accel_rng)
     field = magnetic_field(position, settings, field_rng)
     to_body = attitude.conjugate(orientation)
@@ -134,9 +132,7 @@ def _accel(force: Floats, settings: ImuSettings, rng: Generator) -> Floats:
     return force + bias + _white(len(force), settings.accel_noise, rng)
 
 
-def _fusion(
-    orientation: Floats, field: Floats, turning_error: Floats, settings: ImuSettings, rng: Generator
-) -> Floats:
+def _fusion(orientation: Floats, field: Floats, turning_error: Floats, settings: ImuSettings, rng: Generator) -> Floats:
     """Orientation as the chip's fusion has it, before rounding, (n, 4).
 
     Heading: the gyro's turning, error and all, pulled towards the compass. The field's direction is taken for

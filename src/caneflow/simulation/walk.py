@@ -238,9 +238,7 @@ def _eased_integral(x: Floats) -> Floats:
     return x**4 * (2.5 + x * (x - 3.0))
 
 
-def _steps(
-    distance: Floats, legs: Sequence[_Leg], time: Floats, settings: MotionSettings, rng: Generator
-) -> Floats:
+def _steps(distance: Floats, legs: Sequence[_Leg], time: Floats, settings: MotionSettings, rng: Generator) -> Floats:
     """Steps made at `time`: the cadence, like the step length, goes with the square root of the speed.
 
     Every leg is a whole number of steps, because a walker stops with both feet down; all of them together are an
