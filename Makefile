@@ -1,10 +1,10 @@
-# One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make docs`, `make bench`.
+# One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make docs`, `make soak`, `make bench`.
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 WALK := build/walk.mcap
 
-.PHONY: run test lint docs bench clean
+.PHONY: run test lint docs soak bench clean
 
 # The environment is made once, and again when the project's needs change.
 $(BIN)/.installed: pyproject.toml
@@ -34,6 +34,10 @@ lint: $(BIN)/.installed
 docs: $(BIN)/.installed
 	$(BIN)/python -m caneflow.messages.reference docs
 	$(BIN)/python -m caneflow.runtime.yaml_reference docs
+
+# The long tests: every shared walk at real time and at full speed, calm and under load.
+soak: $(BIN)/.installed
+	$(BIN)/pytest -m long
 
 bench: $(BIN)/.installed
 	$(BIN)/pytest --benchmark-enable --benchmark-only

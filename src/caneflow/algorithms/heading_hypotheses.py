@@ -1,184 +1,236 @@
 """Where a walk led under many hypotheses of the gyro's errors, and how well each explains the magnetic field.
 
-The gyro's yaw drifts by its bias b and its scale error s; indoors the compass errs by ten degrees and more, but it
-errs by the same amount at the same place. So each hypothesis (b, s) keeps a track of its own, and is weighed by how
-smooth a map of the field's direction its track leads to: a Gaussian process over places, unknown in its mean.
+The gyro's yaw drifts with its bias b and its scale error s. Indoors the compass errs by ten degrees and more, but by
+the same amount at the same place. So each hypothesis (b, s) has a track of its own, and is weighed by how well the
+directions of the field along it make one smooth map: a Gaussian process over places, its mean unknown. Nothing is
+linearised: a bias that bends the whole track is weighed with the places where it puts the knots.
+
+Letters: knot, a stretch of the walk over which the field's direction is averaged; H hypotheses; n knots.
 """
 
+import cmath
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, MultipleOf
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _DEGREE: Final = math.pi / 180.0
+_CONSTANT: Final = 1.0  # rad^2, variance of the field's mean direction: nearly unknown
+_SCALES: Final = math.sqrt(3.0) * np.array([-1.0, 0.0, 1.0])  # Gauss-Hermite points of a normal density,
+_SCALE_MASSES: Final = np.array([1.0, 4.0, 1.0]) / 6.0  # and their weights
+_REFINE_EVERY: Final = 16  # knots
+_TOO_FEW: Final = 4.0  # biases that carry the weight: fewer, and the grid is too coarse
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeadingSettings:
     """What is believed of gyro and field before a walk."""
 
-    biases: Annotated[int, Ge(3)] = 41  # hypotheses of the bias
+    biases: Annotated[int, Ge(5)] = 41  # hypotheses of the gyro's bias, three scale errors each
     largest_bias: Annotated[float, Gt(0)] = 0.8 * _DEGREE  # rad/s
-    scale_error: Annotated[float, Gt(0)] = 0.01  # sd of the gyro's scale about the vertical
-    knot_interval: Annotated[float, Gt(0)] = 0.7  # s over which the field's direction is averaged
-    knots: Annotated[int, Ge(8)] = 128  # places kept; every second one goes when there are more
-    field_error: Annotated[float, Gt(0)] = 14.0 * _DEGREE  # rad, sd of the field's direction from place to place
-    field_scale: Annotated[float, Gt(0)] = 1.8  # m over which it changes
-    rough_error: Annotated[float, Gt(0)] = 1.5 * _DEGREE  # rad, sd of what changes over shorter ways
+    # rad/s, sd of a gyro's bias (cane.md: 0.02 to 0.3 deg/s); all equally likely, gravity's axes tell which it is
+    bias_spreads: tuple[float, ...] = (0.025 * _DEGREE, 0.05 * _DEGREE, 0.1 * _DEGREE, 0.2 * _DEGREE, 0.4 * _DEGREE)
+    scale_error: Annotated[float, Gt(0)] = 0.007  # sd of the gyro's scale (cane.md)
+    knot_interval: Annotated[float, Gt(0)] = 0.7  # s
+    knots: Annotated[int, Ge(8), MultipleOf(2)] = 128  # kept; when full, every second one goes
+    field_error: Annotated[float, Gt(0)] = 14.0 * _DEGREE  # rad, sd of the field's direction indoors
+    field_scale: Annotated[float, Gt(0)] = 1.8  # m over which it changes (cane.md: 10 deg over 2 m)
+    rough_error: Annotated[float, Gt(0)] = 3.0 * _DEGREE  # rad, sd of what changes over shorter ways
     rough_scale: Annotated[float, Gt(0)] = 0.5  # m
-    field_noise: Annotated[float, Gt(0)] = 0.8 * _DEGREE  # rad, of one average
+    field_noise: Annotated[float, Gt(0)] = 0.8 * _DEGREE  # rad, sd of a knot's average: mostly of tilt
+    chip_noise: Annotated[float, Gt(0)] = 4.0 * _DEGREE  # rad, where the chip's yaw stands in for the field: it lags
 
 
-# deg/s, standard deviations of a gyro's bias that are thought equally likely: none is known, and the two axes that
-# gravity shows tell which it is
-SPREADS: Final = np.array([0.025, 0.05, 0.1, 0.2, 0.4]) * _DEGREE
+class Knot(NamedTuple):
+    """One average of the field's direction, and what leads to it from the knot before."""
+
+    elapsed: float  # s since the start
+    turned: float  # rad, by the gyro since the start
+    move: complex  # m, from the knot before, x + jy in the gyro's frame
+    direction: float  # rad, in the gyro's frame, unwrapped
+    noise: float  # rad, sd of the direction
+    variance: float  # m^2 per axis, of the position whatever the heading; never falls
+
+
+class Heading(NamedTuple):
+    """What the hypotheses say together."""
+
+    position: complex  # m, x + jy
+    yaw: float  # rad, to be added to the gyro's
+    yaw_variance: float  # rad^2
+    xx: float  # m^2, spread of the position over the hypotheses
+    xy: float
+    yy: float
 
 
 class HeadingHypotheses:
-    """A weighted set of headings and tracks."""
+    """A weighted set of tracks."""
 
     def __init__(self, settings: HeadingSettings) -> None:
         self._settings = settings
-        self._elapsed = 0.0  # s since the start
-        self._turned = 0.0  # rad by the gyro since the start
-        self._pending = 0j  # m, moved since tracks were advanced, in the gyro's frame
-        self._horizontal: tuple[float, float, float, float] | None = None
-        # knots: what the tracks are made of again when hypotheses change
-        self._times: list[float] = []
-        self._turns: list[float] = []
-        self._moves: list[complex] = []  # to a knot from the one before
-        self._fields: list[float] = []
-        self._variances: list[float] = []
-        self.variance = 0.0
-        self._since_knot = 0j
-        self._knot_start = 0.0
-        self._field_sum = 0j
-        self._field_count = 0
-        grid = np.sinh(np.linspace(-2.0, 2.0, settings.biases)) / math.sinh(2.0) * settings.largest_bias
-        self._spread(grid)
+        self._elapsed = 0.0
+        self._turned = 0.0
+        self._pending = 0j  # m, moved since the tracks were advanced
+        self._since_knot = 0j  # m, moved since the last knot
+        self._knot_due = settings.knot_interval
+        self._field_sum, self._field_noise = 0j, 0.0
+        self._knots: list[Knot] = []
+        self._spread_share = np.full(len(settings.bias_spreads), 1.0 / len(settings.bias_spreads))
+        grid = np.sinh(np.linspace(-2.0, 2.0, settings.biases)) / math.sinh(2.0)
+        self._start(settings.largest_bias * grid)
 
-    def _spread(self, biases: Floats) -> None:
-        """Start over with these biases, each with three scale errors (Gauss-Hermite)."""
-        cells = np.gradient(biases)
-        scales = math.sqrt(3.0) * self._settings.scale_error * np.array([-1.0, 0.0, 1.0])
-        masses = np.array([1.0, 4.0, 1.0]) / 6.0
-        self.biases = np.repeat(biases, 3)
-        self.scales = np.tile(scales, len(biases))
-        self._log_cell = np.log(np.repeat(cells, 3) * np.tile(masses, len(biases)))
-        count, knots = len(self.biases), self._settings.knots
-        self.tracks: Complexes = np.zeros(count, np.complex128)
-        self._at: Complexes = np.zeros((count, knots), np.complex128)
-        self._inverse: Floats = np.zeros((count, knots, knots))
-        self._white: Floats = np.zeros((count, knots))
-        self._log_likelihood: Floats = np.zeros(count)
-        self.weights: Floats = np.ones(count)
-        self._reweigh()
-
-    def headings(self, elapsed: float, turned: float) -> Floats:
-        """Yaw (rad) to be added to the gyro's, by hypothesis."""
-        angles: Floats = -(self.biases * elapsed + self.scales * turned)
-        return angles
+    @property
+    def bias(self) -> float:
+        """The gyro's bias about the vertical, rad/s."""
+        return float((self._weights * self._biases).sum())
 
     def move(self, interval: float, turn: float, dx: float, dy: float) -> None:
-        """`interval` s on: turned by `turn` rad by the gyro, moved by (dx, dy) m in the gyro's frame."""
+        """Go on by `interval` s, `turn` rad by the gyro, and (dx, dy) m in the gyro's frame."""
         self._elapsed += interval
         self._turned += turn
         self._pending += complex(dx, dy)
 
-    def field(self, direction: float) -> None:
-        """Direction (rad) of the horizontal field in the gyro's frame."""
-        self._field_sum += complex(math.cos(direction), math.sin(direction))
-        self._field_count += 1
+    def field(self, direction: float, *, from_chip: bool) -> None:
+        """Take the direction (rad) of the horizontal field in the gyro's frame, from the chip's yaw if need be."""
+        self._field_sum += cmath.rect(1.0, direction)
+        self._field_noise = self._settings.chip_noise if from_chip else self._settings.field_noise
 
-    def advance(self) -> None:
-        """Bring the tracks up to now, and take in a knot when it is due."""
-        turns = np.exp(1j * self.headings(self._elapsed, self._turned))
-        self.tracks += turns * self._pending
+    def level_biases(self, across: float, across_sd: float, along: float, along_sd: float) -> None:
+        """What gravity shows of the bias about two level axes (rad/s): it tells how good a gyro this is."""
+        spreads = np.array(self._settings.bias_spreads)
+        log = np.zeros(len(spreads))
+        for value, sd in ((across, across_sd), (along, along_sd)):
+            variance = spreads**2 + sd**2
+            log -= 0.5 * value**2 / variance + 0.5 * np.log(variance)
+        share = np.exp(log - log.max())
+        self._spread_share = share / share.sum()
+
+    def advance(self, variance: float) -> None:
+        """Bring the tracks up to now, and take in a knot when it is due.
+
+        `variance` (m^2, per axis) is the position's for a known heading: it blurs the map.
+        """
+        self._tracks += np.exp(1j * self._yaws(self._elapsed, self._turned)) * self._pending
         self._since_knot += self._pending
         self._pending = 0j
-        if self._elapsed - self._knot_start >= self._settings.knot_interval:
-            if self._field_count:
-                self._add_knot()
-            self._knot_start = self._elapsed
-            self._field_sum, self._field_count = 0j, 0
+        if self._elapsed >= self._knot_due:
+            if self._field_sum:
+                self._take_knot(variance)
+            self._knot_due = self._elapsed + self._settings.knot_interval
+            self._field_sum = 0j
 
-    def horizontal_bias(self, first: float, first_sd: float, second: float, second_sd: float) -> None:
-        """What the two horizontal axes show of the gyro's bias, rad/s, and how well."""
-        self._horizontal = first, first_sd, second, second_sd
+    def heading(self) -> Heading:
+        """The mean over all hypotheses, now."""
+        yaws = self._yaws(self._elapsed, self._turned)
+        yaw = float((self._weights * yaws).sum())
+        centre = complex((self._weights * self._tracks).sum())
+        off = self._tracks - centre
+        x, y = off.real, off.imag
+        return Heading(
+            position=centre + cmath.rect(1.0, yaw) * self._pending,
+            yaw=yaw,
+            yaw_variance=float((self._weights * (yaws - yaw) ** 2).sum()),
+            xx=float((self._weights * x * x).sum()),
+            xy=float((self._weights * x * y).sum()),
+            yy=float((self._weights * y * y).sum()),
+        )
 
-    def mean(self) -> tuple[complex, float, Floats]:
-        """Position (m, x + jy), yaw (rad) to be added to the gyro's, covariance (2, 2) of the position, now."""
-        heading = float(self.weights @ self.headings(self._elapsed, self._turned))
-        centre = complex((self.weights * self.tracks).sum())
-        off = self.tracks - centre
-        xx = float((self.weights * off.real**2).sum())
-        xy = float((self.weights * off.real * off.imag).sum())
-        yy = float((self.weights * off.imag**2).sum())
-        turned = complex(math.cos(heading), math.sin(heading))
-        return centre + turned * self._pending, heading, np.array([[xx, xy], [xy, yy]])
+    def _yaws(self, elapsed: float, turned: float) -> Floats:
+        """Yaw (rad) to be added to the gyro's by each hypothesis, (H,)."""
+        yaws: Floats = -(self._biases * elapsed + self._scales * turned)
+        return yaws
 
-    def _add_knot(self) -> None:
-        direction = math.atan2(self._field_sum.imag, self._field_sum.real)
-        if len(self._times) == self._settings.knots:
-            self._thin()
-        self._times.append(self._elapsed)
-        self._variances.append(max(self.variance, self._variances[-1] if self._variances else 0.0))
-        self._turns.append(self._turned)
-        self._moves.append(self._since_knot)
+    def _start(self, biases: Floats) -> None:
+        """Hypotheses of these biases, (B,) and growing, with nothing learnt."""
+        self._biases = np.repeat(biases, len(_SCALES))
+        self._scales = np.tile(self._settings.scale_error * _SCALES, len(biases))
+        self._log_mass = np.log(np.outer(np.gradient(biases), _SCALE_MASSES).ravel())
+        count, room = len(self._biases), self._settings.knots
+        self._tracks: Complexes = np.zeros(count, np.complex128)
+        self._places: Complexes = np.zeros((count, room), np.complex128)
+        self._inverse_factor: Floats = np.zeros((count, room, room))  # of the Cholesky factor of the covariance
+        self._white: Floats = np.zeros((count, room))  # residuals, whitened
+        self._log_likelihood: Floats = np.zeros(count)
+        self._weigh()
+
+    def _take_knot(self, variance: float) -> None:
+        if len(self._knots) == self._settings.knots:
+            self._rebuild(_thinned(self._knots))
+        direction = cmath.phase(self._field_sum)
+        if self._knots:
+            last = self._knots[-1]
+            variance = max(variance, last.variance)
+            direction = last.direction + math.remainder(direction - last.direction, 2.0 * math.pi)
+        knot = Knot(self._elapsed, self._turned, self._since_knot, direction, self._field_noise, variance)
         self._since_knot = 0j
-        if self._fields:
-            direction = self._fields[0] + math.remainder(direction - self._fields[0], 2 * math.pi)
-        self._fields.append(direction)
-        self._at[:, len(self._times) - 1] = self.tracks
-        self._condition(len(self._times) - 1)
-        self._reweigh()
+        self._knots.append(knot)
+        self._condition(len(self._knots) - 1)
+        self._weigh()
+        if len(self._knots) % _REFINE_EVERY == 0 and self._is_coarse():
+            self._rebuild(self._knots)
+
+    def _is_coarse(self) -> bool:
+        by_bias = self._weights.reshape(-1, len(_SCALES)).sum(axis=1)
+        return bool(1.0 / (by_bias**2).sum() < _TOO_FEW)
+
+    def _rebuild(self, knots: list[Knot]) -> None:
+        """Hypotheses where the weight is, with tracks from all knots anew."""
+        mean = self.bias
+        spread = math.sqrt(float((self._weights * (self._biases - mean) ** 2).sum()))
+        cell = float(np.diff(self._biases[:: len(_SCALES)]).min())
+        half = min(5.0 * max(spread, cell), 2.0 * self._settings.largest_bias)
+        self._start(np.linspace(mean - half, mean + half, self._settings.biases))
+        self._knots = knots
+        before = (0.0, 0.0)
+        for row, knot in enumerate(knots):
+            middle = 0.5 * (before[0] + knot.elapsed), 0.5 * (before[1] + knot.turned)
+            self._tracks += np.exp(1j * self._yaws(*middle)) * knot.move
+            self._condition(row)
+            before = knot.elapsed, knot.turned
+        self._tracks += np.exp(1j * self._yaws(self._elapsed, self._turned)) * self._since_knot
+        self._weigh()
 
     def _condition(self, n: int) -> None:
-        """Take knot n into the Gaussian process of every hypothesis: one more row of the inverse Cholesky factor."""
-        s = self._settings
-        residual = self._fields[n] - self._fields[0] + self.headings(self._times[n], self._turns[n])
-        apart = np.abs(self._at[:, :n] - self._at[:, n : n + 1])
-        wide = s.field_scale**2 + self._variances[n] - np.array(self._variances[:n])
-        kernel = (
-            s.field_error**2 * (s.field_scale**2 / wide) * np.exp(-0.5 * apart**2 / wide)
-            + s.rough_error**2 * np.exp(-apart / s.rough_scale)
-            + 1.0
-        )
-        inverse = self._inverse[:, :n, :n]
-        w = np.einsum("hij,hj->hi", inverse, kernel)
-        own = s.field_error**2 + s.rough_error**2 + 1.0 + s.field_noise**2
-        d = np.sqrt(np.maximum(own - (w * w).sum(axis=1), 0.25 * s.field_noise**2))
-        self._inverse[:, n, :n] = -np.einsum("hi,hij->hj", w, inverse) / d[:, None]
-        self._inverse[:, n, n] = 1.0 / d
-        white = (residual - (w * self._white[:, :n]).sum(axis=1)) / d
+        """Add the evidence of knot n given those before: one more row of the inverse Cholesky factor.
+
+        The position's own uncertainty, u^2 per axis and growing along the walk, blurs the map: the mean of the kernel
+        over it is l^2 / (l^2 + u^2) exp(-d^2 / 2 (l^2 + u^2)).
+        """
+        s, knot = self._settings, self._knots[n]
+        self._places[:, n] = self._tracks
+        residual = knot.direction - self._knots[0].direction + self._yaws(knot.elapsed, knot.turned)
+        apart = np.abs(self._places[:, :n] - self._places[:, n : n + 1])
+        wide = s.field_scale**2 + knot.variance - np.array([k.variance for k in self._knots[:n]])
+        kernel = (s.field_error * s.field_scale) ** 2 / wide * np.exp(apart * apart / (-2.0 * wide))
+        kernel += s.rough_error**2 * np.exp(apart / -s.rough_scale) + _CONSTANT
+        # einsum keeps to its own loops: the sums are the same on any number of threads
+        factor = self._inverse_factor[:, :n, :n]
+        row = np.einsum("hij,hj->hi", factor, kernel)
+        own = s.field_error**2 + s.rough_error**2 + _CONSTANT + knot.noise**2
+        deviation = np.sqrt(np.maximum(own - (row * row).sum(axis=1), knot.noise**2))
+        self._inverse_factor[:, n, :n] = np.einsum("hi,hij->hj", row, factor) / -deviation[:, None]
+        self._inverse_factor[:, n, n] = 1.0 / deviation
+        white = (residual - (row * self._white[:, :n]).sum(axis=1)) / deviation
         self._white[:, n] = white
-        self._log_likelihood -= 0.5 * white * white + np.log(d)
+        self._log_likelihood -= 0.5 * white * white + np.log(deviation)
 
-    def _thin(self) -> None:
-        raise NotImplementedError
+    def _weigh(self) -> None:
+        spreads = np.array(self._settings.bias_spreads)
+        parts = np.exp(-0.5 * (self._biases[:, None] / spreads) ** 2) * (self._spread_share / spreads)
+        log = np.log(parts.sum(axis=1) + 1e-300) + self._log_mass + self._log_likelihood
+        weights = np.exp(log - log.max())
+        self._weights = weights / weights.sum()
 
-    def _log_prior(self) -> Floats:
-        spreads = SPREADS
-        log = np.zeros(len(spreads))
-        if self._horizontal is not None:
-            first, first_sd, second, second_sd = self._horizontal
-            for value, sd in ((first, first_sd), (second, second_sd)):
-                variance = spreads**2 + sd**2
-                log -= 0.5 * value**2 / variance + 0.5 * np.log(variance)
-        log -= log.max()
-        share = np.exp(log)
-        share /= share.sum()
-        density = (share / spreads * np.exp(-0.5 * (self.biases[:, None] / spreads) ** 2)).sum(axis=1)
-        return np.log(density + 1e-300) + self._log_cell
 
-    def _reweigh(self) -> None:
-        log = self._log_prior() + self._log_likelihood
-        log -= log.max()
-        weights = np.exp(log)
-        self.weights = weights / weights.sum()
+def _thinned(knots: list[Knot]) -> list[Knot]:
+    """Every second knot, each with the way from the one that is kept before it."""
+    kept = []
+    for first, second in zip(knots[::2], knots[1::2], strict=True):
+        kept.append(second._replace(move=first.move + second.move))
+    return kept

@@ -19,7 +19,7 @@ SMOOTHING = 0.1  # s, of strength and dip: the magnetometer's noise is no distur
 TURNING = math.radians(20.0)  # rad/s; a field that is steady while the body turns is no magnet that it carries
 LARGEST_DISTRUST = 1000.0
 SETTLED = 1.5  # times the steady variance, below which corrections are of now, not of what was
-LEVELLING_MEMORY = 2.0  # s of readings that count before the attitude is level
+LEVELLING_MEMORY = 1.0  # s of readings that count before the attitude is level
 LEAST_LEVEL = 1e-3  # of the field's strength; a field as steep as that has no yaw
 
 
