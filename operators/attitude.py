@@ -27,8 +27,6 @@ Method: TypeAlias = Literal["attitude_filter", "madgwick"]
 class AttitudeSettings:
     """Which filter, what each may be told, and what of the sample it may use."""
 
-    __pydantic_config__ = {"extra": "forbid"}
-
     method: Method = "attitude_filter"
     magnetometer: bool = True  # false: yaw by the gyro alone, from 0
     magnetic_north: Annotated[float, Ge(-2.0 * math.pi), Le(2.0 * math.pi)] = NORTH_YAW  # rad, its yaw in R0

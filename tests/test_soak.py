@@ -1,4 +1,4 @@
-"""Minutes, not seconds: `make soak`. The same recording gives the same bytes at any speed and under load, again and again."""
+"""Minutes, not seconds: `make soak`. A recording gives the same bytes at any speed and under load, every time."""
 
 import subprocess
 import sys

@@ -55,7 +55,8 @@ class Refusals:
         if not self.counts:
             return "no row refused"
         causes = (f"{n} {cause} (first in line {self.first_lines[cause]})" for cause, n in self.counts.items())
-        return f"{self.counts.total()} rows refused: {', '.join(causes)}"
+        total = self.counts.total()
+        return f"{total} row{'s' if total > 1 else ''} refused: {', '.join(causes)}"
 
 
 class ImuTable:
