@@ -27,6 +27,7 @@ class ReplaySettings:
     origin_ns: int  # the stamp at which the whole replay begins, the same for every node
     duration_s: float | None = None  # s, from the origin
     loop_s: float | None = None  # s of one turn; None: play once
+    started_s: float | None = None  # s of the machine's monotonic clock at the origin; None: when it is started
 
 
 class Replay(Source):
@@ -46,7 +47,9 @@ class Replay(Source):
         if speed is None:
             yield from self.recorded()
         else:
-            yield from paced(self.recorded(), self._settings.origin_ns, speed)
+            # A replayer in the place of one that was killed catches up; its readers know what they have had.
+            started = time.monotonic() if self._settings.started_s is None else self._settings.started_s
+            yield from paced(self.recorded(), self._settings.origin_ns, started, speed)
 
     def recorded(self) -> Iterator[tuple[str, Sample | Encoded]]:
         """Yield the recorded samples in the order of their stamps; a loop goes on with shifted stamps."""
@@ -79,9 +82,8 @@ def shifted(sample: Encoded, by: int) -> Sample | Encoded:
     return msgspec.structs.replace(message, stamp=message.stamp + by)
 
 
-def paced(samples: Iterator[tuple[str, Sample | Encoded]], origin: int, speed: float) -> Brought:
-    """Hold each sample until its time, counted from one start so that errors do not add up."""
-    started = time.monotonic()
+def paced(samples: Iterator[tuple[str, Sample | Encoded]], origin: int, started: float, speed: float) -> Brought:
+    """Hold each sample until its time, counted from one start (s, monotonic) so that errors do not add up."""
     for port, sample in samples:
         due = started + (sample.stamp - origin) / 1e9 / speed
         while (wait := due - time.monotonic()) > 0:

@@ -8,7 +8,6 @@ so positive Doppler means approaching.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import ifft, rfft
 
 from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 
@@ -22,7 +21,7 @@ def fast_time_frequencies(bins: int, range_step: float) -> NDArray[np.float64]:
 
 
 class AnalyticSignal:
-    """A filter for scans of one shape; its gain is worked out once."""
+    """A filter for scans of one length; its band is worked out once."""
 
     def __init__(self, *, bins: int, range_step: float, carrier: float, bandwidth: float) -> None:
         """For scans of `bins` samples every `range_step` m; `carrier` and `bandwidth` of the pulse in Hz.
@@ -37,11 +36,14 @@ class AnalyticSignal:
                 f"a pulse at {carrier:.4g} Hz, {bandwidth:.3g} Hz wide, does not show in {bins} samples "
                 f"every {range_step:.4g} m: they hold 0..{frequencies[-1]:.4g} Hz"
             )
-        self._gain = np.where(inside, 2, 0).astype(np.complex64)  # of the type it scales: no casts
+        self._first, self._end = int(inside.argmax()), int(np.flatnonzero(inside)[-1]) + 1  # lines of the band
         self._bins = bins
 
     def __call__(self, scans: NDArray[np.number]) -> NDArray[np.complex64]:
         """The analytic signals of real `scans`, shape (..., bins); same shape."""
-        one_sided = rfft(scans.astype(np.float32))
-        one_sided *= self._gain
-        return ifft(one_sided, self._bins, overwrite_x=True).astype(np.complex64, copy=False)
+        one_sided = np.fft.rfft(scans.astype(np.float32))[..., self._first : self._end]
+        spectrum = np.zeros(scans.shape, np.complex64)
+        np.multiply(one_sided, 2 / self._bins, out=spectrum[..., self._first : self._end])
+        # "forward": the inverse's 1 / bins is in the factor already
+        signal: NDArray[np.complex64] = np.fft.ifft(spectrum, norm="forward")
+        return signal

@@ -1,5 +1,6 @@
 """How the cane was held a moment ago: attitudes and turn rates of the recent past, asked for by stamp."""
 
+import math
 from bisect import bisect_left, bisect_right
 from typing import Final
 
@@ -28,8 +29,7 @@ class AttitudeHistory:
             elapsed_ns = stamp_ns - self._stamps[-1]
             if elapsed_ns <= 0:
                 raise ValueError(f"attitude at {stamp_ns} ns is not newer than the last, {self._stamps[-1]} ns")
-            rate = (gyro[0] ** 2 + gyro[1] ** 2 + gyro[2] ** 2) ** 0.5
-            turned = self._turned[-1] + rate * elapsed_ns * 1e-9
+            turned = self._turned[-1] + math.hypot(*gyro) * elapsed_ns * 1e-9
         self._stamps.append(stamp_ns)
         self._orientations.append(orientation)
         self._turned.append(turned)
@@ -62,6 +62,8 @@ class AttitudeHistory:
 
 def _between(older: Quaternion, newer: Quaternion, share: float) -> Quaternion:
     """The way from `older` to `newer`, along the shorter arc, gone to `share`: linear, then normalised."""
-    sign = -1.0 if sum(a * b for a, b in zip(older, newer, strict=True)) < 0 else 1.0
-    w, x, y, z = ((1.0 - share) * a + sign * share * b for a, b in zip(older, newer, strict=True))
-    return normalized((w, x, y, z))
+    (a, b, c, d), (w, x, y, z) = older, newer
+    rest = 1.0 - share
+    if a * w + b * x + c * y + d * z < 0.0:
+        share = -share
+    return normalized((rest * a + share * w, rest * b + share * x, rest * c + share * y, rest * d + share * z))

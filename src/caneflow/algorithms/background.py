@@ -16,7 +16,7 @@ class Background:
     def __init__(self, time_constant: float) -> None:
         """With the given `time_constant` (s) of forgetting."""
         self._time_constant = time_constant
-        self._mean: NDArray[np.complex64] | None = None
+        self._mean: NDArray[np.float32] | None = None  # real and imaginary parts in turn
         self._weight = 0.0  # sum of exp(-age / time constant) over the scans seen
 
     def remove(self, scan: NDArray[np.complex64], elapsed: float) -> None:
@@ -25,10 +25,11 @@ class Background:
         `elapsed` is the time (s) since the scan before. As every scan arrives with weight 1, the mean is right
         from the first scan on: no start value has to fade out.
         """
+        parts = scan.view(np.float32)  # all is linear: real arithmetic takes half of the time
         if self._mean is None:
-            self._mean = np.zeros_like(scan)
+            self._mean = np.zeros_like(parts)
         self._weight = self._weight * math.exp(-elapsed / self._time_constant) + 1.0
-        share = 1.0 / self._weight
-        scan -= self._mean
-        self._mean += scan * np.float32(share)
-        scan *= np.float32(1.0 - share)
+        parts -= self._mean
+        step = parts * (1.0 / self._weight)
+        self._mean += step
+        parts -= step

@@ -1,17 +1,18 @@
-"""`method: best`: radar velocity, IMU and magnetic field into a track, one estimate per IMU sample (docs/methods/best.md).
+"""`method: best`: radar velocity, IMU and magnetic field into a track (docs/methods/best.md).
 
 Velocity is estimated in the gyro's frame (walk_motion.py), the heading of that frame and the track by weighing many
 gyro errors against the magnetic field (heading_hypotheses.py), height by itself (heave.py).
 """
 
+import cmath
 import math
-from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt
+from numpy.typing import NDArray
 
 from caneflow.algorithms.dead_reckoning import (
     LONGEST_INTERVAL,
@@ -22,7 +23,7 @@ from caneflow.algorithms.dead_reckoning import (
     world_acceleration,
 )
 from caneflow.algorithms.gyro_yaw import GyroYaw
-from caneflow.algorithms.heading_hypotheses import HeadingHypotheses, HeadingSettings
+from caneflow.algorithms.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized, rotate
 from caneflow.algorithms.standing import StandingDetector, StandingSettings
@@ -54,27 +55,26 @@ class CaneFilterSettings:
 
 
 class _Instant(NamedTuple):
-    """What a velocity that comes late is compared with."""
+    """What a velocity that comes late is compared with; horizontal vectors are x + jy in the gyro's frame."""
 
     stamp_ns: int
-    cos_yaw: float  # of the boresight, in the gyro's frame
-    sin_yaw: float
-    gained_x: float  # m/s since the start
-    gained_y: float
-    lever_x: float  # m/s, of the antenna about the IMU
-    lever_y: float
+    facing: complex  # unit vector, the boresight's projection
+    gained: complex  # m/s, by the accelerometer since the start
+    lever: complex  # m/s, of the antenna about the IMU
 
 
 class _Measured(NamedTuple):
-    stamp_ns: int  # when it was true
+    stamp_ns: int
+    delay: float  # s
     forward: float  # m/s
-    left: float
+    left: float  # m/s
     xx: float  # (m/s)^2
-    yy: float
+    yy: float  # (m/s)^2
 
 
-_HISTORY = 64  # IMU samples that a velocity may come late
-_UNOBSERVED = 1e5  # (m/s)^2, variance from which on a component says nothing
+_HISTORY: Final = 64  # IMU samples that a velocity may come late
+_UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
+_POINTING_TIME: Final = 0.2  # s
 
 
 class CaneFilter:
@@ -94,21 +94,19 @@ class CaneFilter:
         self._clock = SampleClock()
         self._yaw = GyroYaw()
         self._standing = StandingDetector(settings.standing)
+        self._pointing = _Pointing(settings.sideways_memory)
         self._motion = WalkMotion(settings.motion)
         self._heading = HeadingHypotheses(settings.heading)
         self._heave = HeaveObserver(settings.heave)
-        self._start_height: float | None = None
-        self._start_yaw = 0.0
-        self._waiting: deque[tuple[int, _Measured]] = deque(maxlen=16)
+        self._start_height: float | None = None  # m, None before the first sample
+        self._waiting: deque[_Measured] = deque(maxlen=16)
         self._history: deque[_Instant] = deque(maxlen=_HISTORY)
-        self._gained_x = self._gained_y = 0.0
-        self._acceleration = (0.0, 0.0)
-        self._boresight_yaw = 0.0
-        self._turning = 0.1  # (rad/s)^2, mean square of the boresight's turn rate
+        self._gained = 0j  # m/s since the start
+        self._acceleration = 0j  # m/s^2 in the gyro's frame, of the last sample
         self._last_velocity_ns: int | None = None
-        self._radar_speed = 0.0
-        self._field: float | None = None
-        self._since_heading = self._since_sideways = 0.0
+        self._radar_speed = 0.0  # m/s, the last
+        self._field: Vector | None = None  # uT, body
+        self._since_heading = self._since_sideways = 0.0  # s
 
     @property
     def gaps(self) -> int:
@@ -126,7 +124,7 @@ class CaneFilter:
         if not valid or (last_ns is not None and stamp_ns - last_ns < self._settings.speed_patience * 1e9):
             return
         variance = self._settings.speed_noise**2 / self._settings.velocity_inflation
-        self._wait(stamp_ns, (speed, 0.0), variance, math.inf, delay)
+        self._waiting.append(_Measured(stamp_ns, delay or 0.0, speed, 0.0, variance, math.inf))
 
     def velocity(
         self,
@@ -136,14 +134,14 @@ class CaneFilter:
         delay: float | None,
     ) -> None:
         """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
-        if covariance[0] < _UNOBSERVED or covariance[2] < _UNOBSERVED:
+        (forward, left), (xx, _, yy) = velocity, covariance
+        if min(xx, yy) < _UNOBSERVED:
             self._last_velocity_ns = stamp_ns
-            self._wait(stamp_ns, velocity, covariance[0], covariance[2], delay)
+            self._waiting.append(_Measured(stamp_ns, delay or 0.0, forward, left, xx, yy))
 
-    def magnetic_field(self, stamp_ns: int, mag: Vector) -> None:
+    def magnetic_field(self, mag: Vector) -> None:
         """Take the field (uT, body frame) of the IMU sample that comes next."""
-        self._field = None if mag == (0.0, 0.0, 0.0) else 0.0
-        self._mag = mag
+        self._field = mag
 
     def imu(
         self,
@@ -158,6 +156,184 @@ class CaneFilter:
         Raises ValueError without an orientation, without any acceleration, or when time does not go on.
         """
         orientation = normalized(required_orientation(orientation, "best"))
-        acceleration = world_acceleration(orientation, accel, linear_accel, "best")
-        interval = self._clock.interval(stamp_ns)
-        raise NotImplementedError
+        in_chips_frame = world_acceleration(orientation, accel, linear_accel, "best")
+        elapsed = self._clock.interval(stamp_ns) or 0.0
+        interval = elapsed if elapsed <= LONGEST_INTERVAL else 0.0
+        stands = self._standing.update(stamp_ns, gyro, in_chips_frame)
+        self._lift(interval, in_chips_frame[2], orientation)
+
+        chip_cos, chip_sin = heading_of(orientation, self._boresight)
+        self._yaw.update(interval, orientation, gyro, chip_cos, chip_sin)
+        turn = cmath.rect(1.0, self._yaw.offset)  # from the chip's frame to the gyro's
+        facing = turn * complex(chip_cos, chip_sin)
+        before = self._motion.position
+        self._predict(elapsed, interval, turn * complex(*in_chips_frame[:2]), facing)
+        turned = self._pointing.update(interval, cmath.phase(facing))
+        self._remember(stamp_ns, turn, facing, orientation, gyro)
+        self._take_velocities(stamp_ns)
+        self._use_gait(interval, stands, turn, orientation, gyro)
+        after = self._motion.position
+
+        self._heading.move(elapsed, turned, after[0] - before[0], after[1] - before[1])
+        self._see_field(orientation)
+        self._since_heading += elapsed
+        if self._since_heading >= self._settings.heading_interval:
+            self._follow_heading()
+        return self._estimate(orientation)
+
+    def _lift(self, interval: float, acceleration: float, orientation: Quaternion) -> None:
+        """Up and down; the hand's height is the zero, because only changes of height are given out."""
+        height = -rotate(orientation, self._pivot)[2]
+        self._heave.update(interval, acceleration, height)
+        if self._start_height is None:
+            self._start_height = height
+
+    def _predict(self, elapsed: float, interval: float, acceleration: complex, facing: complex) -> None:
+        mean = 0.5 * (acceleration + self._acceleration)
+        self._acceleration = acceleration
+        if interval > 0.0:
+            self._gained += self._motion.predict(interval, (mean.real, mean.imag), facing.real, facing.imag)
+        elif elapsed > 0.0:
+            self._motion.coast(elapsed)
+            self._history.clear()
+
+    def _remember(self, stamp_ns: int, turn: complex, facing: complex, orientation: Quaternion, gyro: Vector) -> None:
+        lever = turn * _horizontal(rotate(orientation, _cross(gyro, self._antenna)))
+        self._history.append(_Instant(stamp_ns, facing, self._gained, lever))
+
+    def _take_velocities(self, before_ns: int) -> None:
+        """Correct by what waits with a stamp before this sample's: so the order of delivery does not matter."""
+        while self._waiting and self._waiting[0].stamp_ns < before_ns:
+            measured = self._waiting.popleft()
+            then = self._instant(measured.stamp_ns - round(measured.delay * 1e9))
+            since = self._gained - then.gained - then.lever  # from the antenna's velocity then to the IMU's now
+            facing = then.facing / abs(then.facing)
+            sides = ((facing, measured.forward, measured.xx), (facing * 1j, measured.left, measured.yy))
+            for direction, value, variance in sides:
+                if variance < _UNOBSERVED:
+                    moved = (since * direction.conjugate()).real
+                    noise = variance * self._settings.velocity_inflation
+                    self._motion.observe_velocity((direction.real, direction.imag), value + moved, noise)
+            self._radar_speed = measured.forward
+
+    def _instant(self, stamp_ns: int) -> _Instant:
+        """Between the samples about a time; the oldest kept when that is not as old."""
+        newer = self._history[-1]
+        for older in reversed(self._history):
+            if older.stamp_ns <= stamp_ns:
+                if newer.stamp_ns == older.stamp_ns:
+                    return older
+                share = (stamp_ns - older.stamp_ns) / (newer.stamp_ns - older.stamp_ns)
+                return _Instant(
+                    stamp_ns,
+                    older.facing + share * (newer.facing - older.facing),
+                    older.gained + share * (newer.gained - older.gained),
+                    older.lever + share * (newer.lever - older.lever),
+                )
+            newer = older
+        return newer
+
+    def _use_gait(self, interval: float, stands: bool, turn: complex, orientation: Quaternion, gyro: Vector) -> None:
+        """A bearer who stands does not move; one who walks does not move his hand sideways."""
+        settings, motion = self._settings, self._motion
+        self._since_sideways += interval
+        if stands and abs(self._radar_speed) < settings.radar_standing:
+            variance = settings.standing_speed**2 * settings.standing_inflation
+            motion.observe_velocity((1.0, 0.0), 0.0, variance)
+            motion.observe_velocity((0.0, 1.0), 0.0, variance)
+        elif self._since_sideways >= settings.sideways_interval:
+            self._since_sideways = 0.0
+            ahead = cmath.rect(1.0, self._pointing.yaw + motion.pointing)
+            left = ahead * 1j
+            lever = turn * _horizontal(rotate(orientation, _cross(gyro, self._pivot)))
+            hand = complex(*motion.velocity) + lever
+            speed = (hand * ahead.conjugate()).real
+            # the hand's velocity to the left of the way is what a turning body gives it; linear in beta about now
+            value = settings.hand_ahead * self._pointing.rate
+            value -= (lever * left.conjugate()).real + speed * motion.pointing
+            variance = settings.sideways**2 + settings.sideways_per_turn**2 * self._pointing.turning
+            motion.observe_velocity((left.real, left.imag), value, variance, per_pointing=-speed)
+
+    def _see_field(self, orientation: Quaternion) -> None:
+        """Direction of the field in the gyro's frame; without a magnetometer, of what the chip takes for north."""
+        if self._field is None:
+            self._heading.field(self._yaw.offset, from_chip=True)
+            return
+        x, y, _ = rotate(orientation, self._field)
+        self._heading.field(math.atan2(y, x) + self._yaw.offset, from_chip=False)
+        self._field = None
+
+    def _follow_heading(self) -> None:
+        self._since_heading = 0.0
+        biases = self._yaw.level_biases()
+        if biases is not None:
+            self._heading.level_biases(*biases)
+        p = self._motion.covariance
+        self._heading.advance(0.5 * float(p[0, 0] + p[1, 1]))
+
+    def _estimate(self, orientation: Quaternion) -> PoseEstimate:
+        heading = self._heading.heading()
+        turn = cmath.rect(1.0, heading.yaw)
+        velocity = turn * complex(*self._motion.velocity)
+        rise = self._heave.height - (self._start_height or 0.0)
+        return PoseEstimate(
+            position=(heading.position.real, heading.position.imag, rise),
+            velocity=(velocity.real, velocity.imag, self._heave.rate),
+            orientation=multiply(from_yaw(self._yaw.offset + heading.yaw), orientation),
+            covariance=self._covariance(heading, turn, velocity),
+        )
+
+    def _covariance(self, heading: Heading, turn: complex, velocity: complex) -> NDArray[np.float64]:
+        """(6, 6) of position and velocity: the filter's, what the headings add, and the radar's scale."""
+        cos, sin = turn.real, turn.imag
+        turned = np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, cos, -sin], [0, 0, sin, cos]])
+        level = turned @ self._motion.covariance @ turned.T
+        x, y = heading.position.real, heading.position.imag
+        scale, yaw = self._settings.speed_scale**2, heading.yaw_variance
+        level[0, 0] += heading.xx + scale * x * x
+        level[1, 1] += heading.yy + scale * y * y
+        level[0, 1] = level[1, 0] = level[0, 1] + heading.xy + scale * x * y
+        level[2, 2] += yaw * velocity.imag**2
+        level[3, 3] += yaw * velocity.real**2
+        level[2, 3] = level[3, 2] = level[2, 3] - yaw * velocity.real * velocity.imag
+        covariance = np.zeros((6, 6))
+        covariance[:2, :2], covariance[:2, 3:5] = level[:2, :2], level[:2, 2:]
+        covariance[3:5, :2], covariance[3:5, 3:5] = level[2:, :2], level[2:, 2:]
+        covariance[2, 2], covariance[5, 5] = self._heave.height_variance, self._heave.rate_variance
+        return covariance
+
+
+class _Pointing:
+    """Where the cane points but for its swing: two poles, and how much it swings or turns."""
+
+    def __init__(self, memory: float) -> None:
+        self._memory = memory
+        self._started = False
+        self._last = 0.0
+        self.yaw = 0.0  # rad, unwrapped
+        self.rate = 0.0  # rad/s
+        self.turning = 0.04  # (rad/s)^2, mean square
+
+    def update(self, interval: float, yaw: float) -> float:
+        """Take the boresight's yaw (rad) `interval` s later; returns how far it turned."""
+        if not self._started:
+            self.yaw, self._started = yaw, True
+            self._last = yaw
+        turned = math.remainder(yaw - self._last, 2.0 * math.pi)
+        self._last = yaw
+        if interval > 0.0:
+            pole = 1.0 / _POINTING_TIME
+            off = math.remainder(yaw - self.yaw, 2.0 * math.pi)
+            self.rate += interval * pole * (pole * off - 2.0 * self.rate)
+            self.yaw += interval * self.rate
+            share = min(interval / self._memory, 1.0)
+            self.turning += share * ((turned / interval) ** 2 - self.turning)
+        return turned
+
+
+def _horizontal(vector: Vector) -> complex:
+    return complex(vector[0], vector[1])
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 # through a Gaussian beam of 50 deg. tests/test_edges.py works both out.
 EDGE_BEYOND_SPEED = 0.8  # resolution cells
 FLAT = np.float32(1e-30)
-BESIDE = np.arange(3)
+AROUND = np.arange(3)[:, None]  # a column and its two neighbours
 
 
 def superior_edges(
@@ -28,9 +28,9 @@ def superior_edges(
     falls = magnitudes[:, :-1] - magnitudes[:, 1:]
     steepest = falls[:, 1:-1].argmax(axis=1)  # counted from column 1: with a neighbour on either side
     left = steepest + np.arange(0, falls.size, falls.shape[1])
-    before, top, after = falls.take(left[:, None] + BESIDE).T
+    before, top, after = falls.take(left + AROUND)
+    rise, drop = top - before, top - after
     # FLAT keeps a flat row from dividing by 0; the clip holds where a neighbour at the rim falls still steeper.
-    curvature = np.minimum(before + after - 2 * top, -FLAT)
-    shift = np.minimum(np.maximum(0.5 * (before - after) / curvature, -0.5), 0.5)
+    shift = np.minimum(np.maximum((rise - drop) / np.maximum(rise + drop, FLAT), -1), 1)
     # The difference between columns i and i + 1 belongs half way between them.
-    return steepest + (1.5 + shift), top
+    return steepest + (1.5 + 0.5 * shift), top

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,8 @@ class CaneGeometry:
 
 def antenna_height(geometry: CaneGeometry, orientation: Quaternion) -> float:
     """Height (m) of the antenna above the ground, the hand being at its nominal height (cane.md row 5)."""
-    from_hand = tuple(a - p for a, p in zip(geometry.antenna, geometry.pivot, strict=True))
-    return geometry.hand_height + rotate(orientation, (from_hand[0], from_hand[1], from_hand[2]))[2]
+    (ax, ay, az), (px, py, pz) = geometry.antenna, geometry.pivot
+    return geometry.hand_height + rotate(orientation, (ax - px, ay - py, az - pz))[2]
 
 
 def pitch(geometry: CaneGeometry, orientation: Quaternion) -> float:
@@ -41,8 +42,7 @@ class Fan:
     steepest: float  # rad
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Rays:
+class Rays(NamedTuple):
     """The rays that meet the ground inside the recorded ranges; shape (0,) twice if there are none."""
 
     rows: NDArray[np.intp]  # shape (K + 2,), growing range bins: ray i is row i + 1, between its neighbours
@@ -65,6 +65,8 @@ class RayCaster:
         self._start, self._step = range_start, range_step
         self._nearest, self._farthest = range_start, range_start + (bins - 1) * range_step
         self._shares = np.linspace(0.0, 1.0, fan.rays + 2)
+        self._squares = (range_start + np.arange(bins) * range_step) ** 2  # m^2, range of each bin
+        self._steepest_square = math.sin(fan.steepest) ** 2
 
     def cast(self, *, height: float, axis: float) -> Rays:
         """The rays of an antenna at `height` m whose beam points `axis` rad (alpha0) below the horizontal.
@@ -82,6 +84,5 @@ class RayCaster:
         scaled = self._shares * ((last - first) / self._step) + ((first - self._start) / self._step + 0.5)
         rows = scaled.astype(np.intp)
         # A ray's angle is that of its bin's centre: rounding would cost up to 2 % of speed at steep angles.
-        sines = height / (self._start + rows[1:-1] * self._step)
-        cosines = np.sqrt(1.0 - np.minimum(sines, math.sin(fan.steepest)) ** 2)
-        return Rays(rows=rows, cosines=cosines)
+        squares = np.minimum(height * height / self._squares[rows[1:-1]], self._steepest_square)  # of the sines
+        return Rays(rows=rows, cosines=np.sqrt(1.0 - squares))

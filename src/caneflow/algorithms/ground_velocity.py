@@ -22,7 +22,7 @@ from caneflow.algorithms.dead_reckoning import GRAVITY, LONGEST_INTERVAL
 from caneflow.algorithms.footprint import CaneGeometry, antenna_height, pitch
 from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
 from caneflow.algorithms.moving_returns import MovingReturns
-from caneflow.algorithms.pulse_pairs import PulsePairs, PulsePairWindow
+from caneflow.algorithms.pulse_pairs import PulsePairWindow
 from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 from caneflow.algorithms.rotations import Quaternion, Vector, rotate
 
@@ -30,6 +30,9 @@ Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 UNOBSERVED: Final = 1e6  # (m/s)^2, variance of a component that is not observed (wire.md)
+_FIRST_SPEEDS: Final = np.arange(-2.0, 4.1, 0.4)  # m/s, near enough to each other for the nearest to be the best
+_MOST_COHERENT: Final = 0.96  # squared coherence above which noise is not what limits a cell
+_FAINT: Final = 1e-30  # power of nothing
 _HEAVES: Final = 64  # IMU samples that a window's middle may lie back
 
 
@@ -43,8 +46,7 @@ class GroundVelocitySettings:
     steepest: Annotated[float, Lt(math.pi / 2)] = math.radians(75)  # rad
     beam_share: Annotated[float, Gt(0)] = 0.7  # of the aperture, to either side of the boresight, that is looked at
     fewest_cells: Annotated[int, Ge(3)] = 5
-    least_coherence: Annotated[float, Gt(0), Lt(1)] = 0.1  # of a cell that counts
-    looks: Annotated[float, Gt(0)] = 1.1  # independent ones per cell and window: neighbouring scans see one speckle
+    looks: Annotated[float, Gt(0)] = 2.75  # independent ones per cell and window: its 40 samples share one speckle
     outlier: Annotated[float, Gt(0)] = 0.3  # rad of phase, from which on a cell loses its weight: walls, people
     least_fit: Annotated[float, Gt(0), Lt(1)] = 0.3  # coherence of all cells with the fit that counts as ground seen
     alias_share: Annotated[float, Gt(0), Le(1)] = 0.9  # of the unambiguous radial speed up to which a fit counts
@@ -93,15 +95,15 @@ class _Cells(NamedTuple):
     per_height: Floats  # rad per m/s and m
 
 
-def beam_factor(grazing: Floats, axis: float, aperture: float) -> Floats:
+def beam_factor(cos_grazing: Floats, axis: float, aperture: float) -> Floats:
     """Mean of cos(phi) over the beam's two-way power, at each grazing angle; `axis` (alpha0) and `aperture` in rad.
 
     The power of a Gaussian beam is exp(-8 ln2 (theta / delta)^2), theta^2 is nearly 2 - 2 cos(theta), and cos(theta) =
     cos(g) cos(axis) cos(phi) + sin(g) sin(axis): a von Mises density in phi, kappa = 16 ln2 cos(g) cos(axis) / delta^2,
     whose mean cosine is I1(kappa) / I0(kappa), here by its series for large kappa.
     """
-    kappa = np.maximum(16.0 * math.log(2.0) * np.cos(grazing) * math.cos(axis) / aperture**2, 1.0)
-    factor: Floats = 1.0 - (0.5 + (0.125 + 0.125 / kappa) / kappa) / kappa
+    inverse = aperture**2 / (16.0 * math.log(2.0) * math.cos(axis)) / cos_grazing
+    factor: Floats = 1.0 - inverse * (0.5 + inverse * (0.125 + 0.125 * inverse))
     return factor
 
 
@@ -154,8 +156,8 @@ class GroundVelocityEstimator:
         height, rise, rise_error = self._vertical(middle_ns, orientation)
         per_speed = 4 * math.pi * returns.parameters.carrier * (2 * delay / settings.window) / SPEED_OF_LIGHT
         axis = pitch(self._geometry, orientation)
-        cells = self._lit(self._window.sums(), height + self._height_error, axis, per_speed)
-        if len(cells.pairs) < settings.fewest_cells:
+        cells = self._lit(height + self._height_error, axis, per_speed)
+        if cells is None:
             return _nothing(delay)
         fit = self._fit(cells, rise, rise_error)
         total = float(cells.power.sum())
@@ -165,7 +167,7 @@ class GroundVelocityEstimator:
             if turn_rate is not None and turn_rate < settings.rest_turn_rate:
                 return _rest(delay, settings.rest_speed)
             return _nothing(delay)
-        if float(np.abs(cells.per_forward).max()) * abs(fit.forward) > settings.alias_share * math.pi:
+        if float(cells.per_forward.max()) * abs(fit.forward) > settings.alias_share * math.pi:
             return _nothing(delay)
         self._learn_height(fit, returns.parameters.scan_period * len(returns.scans))
         return VelocityEstimate(
@@ -182,45 +184,59 @@ class GroundVelocityEstimator:
                 return height, rate, self._settings.heave_error
         return antenna_height(self._geometry, orientation), 0.0, self._settings.vertical_speed
 
-    def _lit(self, sums: PulsePairs, height: float, axis: float, per_speed: float) -> _Cells:
-        """The cells that the beam lights, with the derivatives of their phase."""
+    def _lit(self, height: float, axis: float, per_speed: float) -> _Cells | None:
+        """The cells that the beam lights, with the derivatives of their phase; None when there are too few."""
         settings, aperture = self._settings, self._geometry.aperture
+        half = settings.beam_share * aperture
+        low, high = max(axis - half, settings.shallowest), min(axis + half, settings.steepest)
+        if low >= high or height <= 0.0:
+            return None
+        sums = self._window.sums(height / math.sin(high), height / math.sin(low))
+        if len(sums.ranges) < settings.fewest_cells:
+            return None
         sine = height / sums.ranges
-        grazing = np.arcsin(np.minimum(sine, 1.0))
-        lit = np.abs(grazing - axis) < settings.beam_share * aperture
-        lit &= (grazing > settings.shallowest) & (grazing < settings.steepest) & (sums.power > 0.0)
-        grazing, sine = grazing[lit], sine[lit]
-        cosine = np.cos(grazing)
-        factor = per_speed * beam_factor(grazing, axis, aperture)
+        cosine = np.sqrt(1.0 - sine * sine)
+        along = beam_factor(cosine, axis, aperture)
+        along *= cosine
+        along *= per_speed
+        sine *= -per_speed
         return _Cells(
-            pairs=sums.pairs[lit],
-            power=sums.power[lit],
-            per_forward=factor * cosine,
-            per_vertical=-per_speed * sine,
-            per_height=factor * (-sine * sine / (cosine * height)),
+            pairs=sums.pairs,
+            power=sums.power,
+            per_forward=along,
+            per_vertical=sine,
+            per_height=along * (-height / (cosine * sums.ranges) ** 2),
         )
 
     def _fit(self, cells: _Cells, rise: float, rise_error: float) -> Fit:
-        """Weighted least squares, reweighted twice for outliers; the first guess is a weighted median."""
+        """Weighted least squares about the best of a few speeds, reweighted for outliers.
+
+        The speeds to begin with reach beyond the limit of unambiguous Doppler: ranges see the speed under different
+        angles, so that a speed that has come round fits worse than the true one, and can be refused for what it is.
+        """
         settings = self._settings
-        phase = np.angle(cells.pairs * np.exp(-1j * rise * cells.per_vertical))
-        coherence = np.minimum(np.abs(cells.pairs) / cells.power, 0.98)
-        coherence[coherence < settings.least_coherence] = 0.0
-        square = coherence * coherence
-        weight = 2.0 * settings.looks * square / (1.0 - square)
-        forward = _weighted_median(phase / cells.per_forward, weight * cells.per_forward**2)
+        # over the power: a strong wall has no more to say than faint ground
+        pairs = cells.pairs * np.exp(cells.per_vertical * (-1j * rise)) / (cells.power + _FAINT)
+        square = pairs.real**2 + pairs.imag**2
+        np.minimum(square, _MOST_COHERENT, out=square)
+        weight = square / (1.0 - square)
+        weight *= 2.0 * settings.looks
+        turned = np.exp(_FIRST_SPEEDS[:, None] * (-1j * cells.per_forward))
+        forward = float(_FIRST_SPEEDS[np.einsum("ik,k->i", turned, pairs).real.argmax()])
+        phase = np.angle(pairs * np.exp(cells.per_forward * (-1j * forward))) + cells.per_forward * forward
         vertical = height = 0.0
         residual = phase - cells.per_forward * forward
+        columns = np.stack([cells.per_forward, cells.per_vertical, cells.per_height])
         for _ in range(3):
-            kept = weight / (1.0 + (residual / settings.outlier) ** 2) ** 2
-            columns = np.stack([cells.per_forward, cells.per_vertical, cells.per_height * forward])
-            weighted = columns * kept
-            normal = np.einsum("ik,jk->ij", weighted, columns)
-            right = np.einsum("ik,k->i", weighted, phase)
-            normal[1, 1] += 1.0 / rise_error**2
-            normal[2, 2] += 1.0 / self._height_variance
-            normal[0, 0] += 1.0 / UNOBSERVED
-            (forward, vertical, height), (variance, height_variance) = _solved(normal.tolist(), right.tolist())
+            doubt = 1.0 + (residual * (1.0 / settings.outlier)) ** 2
+            columns[2] = cells.per_height * forward
+            weighted = columns * (weight / (doubt * doubt))
+            normal = np.einsum("ik,jk->ij", weighted, columns).tolist()
+            right = np.einsum("ik,k->i", weighted, phase).tolist()
+            normal[0][0] += 1.0 / UNOBSERVED
+            normal[1][1] += 1.0 / rise_error**2
+            normal[2][2] += 1.0 / self._height_variance
+            (forward, vertical, height), (variance, height_variance) = _solved(normal, right)
             residual = phase - cells.per_forward * forward - cells.per_vertical * vertical - columns[2] * height
         return Fit(forward, rise + vertical, height, variance, height_variance, residual)
 
@@ -235,12 +251,6 @@ class GroundVelocityEstimator:
         gain = before * information / (settings.height_looks + before * information)
         self._height_error += gain * seen
         self._height_variance = before * (1.0 - gain)
-
-
-def _weighted_median(values: Floats, weights: Floats) -> float:
-    order = np.argsort(values, kind="stable")
-    summed = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(summed, 0.5 * summed[-1])])
 
 
 def _solved(normal: list[list[float]], right: list[float]) -> tuple[Triple, tuple[float, float]]:

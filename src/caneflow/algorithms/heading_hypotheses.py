@@ -83,6 +83,7 @@ class HeadingHypotheses:
         self._knots: list[Knot] = []
         self._spread_share = np.full(len(settings.bias_spreads), 1.0 / len(settings.bias_spreads))
         grid = np.sinh(np.linspace(-2.0, 2.0, settings.biases)) / math.sinh(2.0)
+        self._summary = Heading(0j, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._start(settings.largest_bias * grid)
 
     @property
@@ -124,16 +125,21 @@ class HeadingHypotheses:
                 self._take_knot(variance)
             self._knot_due = self._elapsed + self._settings.knot_interval
             self._field_sum = 0j
+        self._summarise()
 
     def heading(self) -> Heading:
-        """The mean over all hypotheses, now."""
+        """The mean over all hypotheses as of the last `advance`, but for the position, which is of now."""
+        moved = cmath.rect(1.0, self._summary.yaw) * self._pending
+        return self._summary._replace(position=self._summary.position + moved)
+
+    def _summarise(self) -> None:
         yaws = self._yaws(self._elapsed, self._turned)
         yaw = float((self._weights * yaws).sum())
         centre = complex((self._weights * self._tracks).sum())
         off = self._tracks - centre
         x, y = off.real, off.imag
-        return Heading(
-            position=centre + cmath.rect(1.0, yaw) * self._pending,
+        self._summary = Heading(
+            position=centre,
             yaw=yaw,
             yaw_variance=float((self._weights * (yaws - yaw) ** 2).sum()),
             xx=float((self._weights * x * x).sum()),
@@ -161,6 +167,7 @@ class HeadingHypotheses:
 
     def _take_knot(self, variance: float) -> None:
         if len(self._knots) == self._settings.knots:
+            self._since_knot += self._knots[-1].move
             self._rebuild(_thinned(self._knots))
         direction = cmath.phase(self._field_sum)
         if self._knots:
@@ -229,8 +236,11 @@ class HeadingHypotheses:
 
 
 def _thinned(knots: list[Knot]) -> list[Knot]:
-    """Every second knot, each with the way from the one that is kept before it."""
-    kept = []
-    for first, second in zip(knots[::2], knots[1::2], strict=True):
+    """Every second knot from the first on, because walks end where they began; each with the way from the one kept.
+
+    `knots` is even in number; the way to the last one, which is not kept, is the caller's to add.
+    """
+    kept = knots[:1]
+    for first, second in zip(knots[1:-1:2], knots[2::2], strict=True):
         kept.append(second._replace(move=first.move + second.move))
     return kept

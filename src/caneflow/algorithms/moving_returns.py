@@ -5,7 +5,7 @@ the background is gone; a longer gap, or a frame of another make, starts anew an
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt
@@ -36,8 +36,7 @@ class MovingReturnsSettings:
     longest_gap: Annotated[int, Ge(0)] = 5  # scans that may be missing in a row before all starts anew
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MovingReturns:
+class MovingReturns(NamedTuple):
     """What one frame adds."""
 
     scans: NDArray[np.complex64]  # shape (n, M), oldest first; zeros for scans that were lost before the frame
@@ -76,13 +75,16 @@ class MovingReturnsFilter:
         if make != self._make:
             self._start_anew(make, parameters, bins, is_complex=scans.dtype.kind == "c")
         period_ns = parameters.scan_period * 1e9
-        stamps = [stamp_ns - round(back * period_ns) for back in range(count - 1, -1, -1)]
-        elapsed_ns, lost, restarted = self._since_last(stamps[0], period_ns)
-        stand_ins = [stamps[0] - elapsed_ns * back // (lost + 1) for back in range(lost, 0, -1)]
+        first_ns = stamp_ns - round((count - 1) * period_ns)
+        elapsed_ns, lost, restarted = self._since_last(first_ns, period_ns)
         self._last_ns = stamp_ns
+        stamps: tuple[int, ...] = (stamp_ns,)
+        if count > 1 or lost:
+            stand_ins = (first_ns - elapsed_ns * back // (lost + 1) for back in range(lost, 0, -1))
+            stamps = (*stand_ins, *(stamp_ns - round(back * period_ns) for back in range(count - 1, -1, -1)))
         return MovingReturns(
             scans=self._without_background(scans, lost, elapsed_ns * 1e-9, parameters.scan_period),
-            stamps_ns=(*stand_ins, *stamps),
+            stamps_ns=stamps,
             lost=lost,
             parameters=parameters,
             restarted=restarted,

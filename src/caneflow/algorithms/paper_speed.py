@@ -4,16 +4,15 @@ One estimate per frame, over the newest `window` scans; it belongs to the window
 """
 
 import math
+from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass, field
 from operator import mul
-from statistics import median
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 from numpy.typing import NDArray
-from scipy.fft import fft
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
 from caneflow.algorithms.edges import EDGE_BEYOND_SPEED, superior_edges
@@ -49,8 +48,7 @@ class PaperSpeedSettings:
     rest: RestSettings = field(default_factory=RestSettings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SpeedEstimate:
+class SpeedEstimate(NamedTuple):
     """Speed of the antenna over ground along the boresight's projection, and how far to trust it."""
 
     speed: float  # m/s, eq. 3; 0 when not valid
@@ -79,7 +77,7 @@ class PaperSpeed:
             shallowest=settings.shallowest,
             steepest=settings.steepest,
         )
-        self._weights = hann(settings.window)
+        self._weights = hann(settings.window).astype(np.complex64)  # of the type they scale: no casts
         self._cell = settings.transform / settings.window  # Doppler bins per resolution cell
         self._beyond = settings.edge_beyond_speed * self._cell if settings.compensate_edge else 0.0  # Doppler bins
         # Slow-time rows to transform; what lies behind the window stays 0.
@@ -102,13 +100,13 @@ class PaperSpeed:
         oldest_ns, newest_ns = self._stamps_ns[0], self._stamps_ns[-1]
         delay = (newest_ns - oldest_ns) * 0.5e-9
         orientation = attitudes.at((oldest_ns + newest_ns) // 2)
-        if orientation is None or sum(self._stand_ins) > settings.most_lost * settings.window:
+        if orientation is None or self._stand_ins.count(True) > settings.most_lost * settings.window:
             return _nothing(delay)
         rays = self._rays(orientation)
         if rays is NO_RAYS:
             return _nothing(delay)
         power = self._power(rays)
-        spectrum = power.sum(axis=0)
+        spectrum: NDArray[np.float32] = np.add.reduce(power)
         approaching, receding, floor = peaks_and_floor(spectrum, self._cell)
         turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
         if turn_rate is not None and is_at_rest(max(approaching, receding), floor, turn_rate, settings.rest):
@@ -150,8 +148,8 @@ class PaperSpeed:
         One range bin's spectrum is speckle, its steepest fall often that of a chance gap below the fastest ground.
         In sum over three bins, most of a range cell apart, the edge lies where the expected spectrum has it.
         """
-        np.multiply(self._window.view()[rays.rows], self._weights, out=self._padded[:, : self._settings.window])
-        power: NDArray[np.float32] = np.abs(fft(self._padded))
+        np.multiply(self._window.rows(rays.rows), self._weights, out=self._padded[:, : self._settings.window])
+        power: NDArray[np.float32] = np.abs(np.fft.fft(self._padded))
         power *= power
         summed = power[:-2] + power[1:-1]
         summed += power[2:]
@@ -159,9 +157,10 @@ class PaperSpeed:
 
     def _has_come_round(self, spectrum: NDArray[np.float32], approaching: float, receding: float, floor: float) -> bool:
         """Whether ground recedes, or approaches so fast that some of its Doppler shows on the other side."""
+        if receding > self._settings.least_peak * floor and receding > RECEDING_SHARE * approaching:
+            return True
         half = len(spectrum) // 2
-        stands_out = receding > self._settings.least_peak * floor and receding > RECEDING_SHARE * approaching
-        return stands_out or bool(spectrum[half:].sum() > spectrum[:half].sum())
+        return bool(np.add.reduce(spectrum[half:]) > np.add.reduce(spectrum[:half]))
 
     def _ray_speeds(
         self, power: NDArray[np.float32], floor: float, per_bin: NDArray[np.float64]
@@ -175,7 +174,7 @@ class PaperSpeed:
         half = settings.transform // 2
         approaching = power[:, : half + 1]
         edges, falls = superior_edges(np.sqrt(approaching))
-        peaks = approaching.max(axis=1)
+        peaks = np.maximum.reduce(approaching, axis=1)
         least_peak, last_edge, beyond = settings.least_peak * floor, settings.alias_share * half, self._beyond
         speeds, heights, ambiguous = [], [], 0
         # Plain Python from here on: for a handful of numbers, numpy's calls cost more.
@@ -193,17 +192,20 @@ class PaperSpeed:
 
     def _average(self, speeds: list[float], falls: list[float], delay: float) -> SpeedEstimate:
         """Eq. 3 and 4, if enough rays agree."""
-        settings = self._settings
-        if len(speeds) < settings.fewest_rays:
+        settings, count = self._settings, len(speeds)
+        if count < settings.fewest_rays:
             return _nothing(delay)
-        middle = median(speeds)
-        if sum([abs(speed - middle) <= settings.agreement for speed in speeds]) < settings.fewest_rays:
+        ordered = sorted(speeds)
+        middle = 0.5 * (ordered[count // 2] + ordered[(count - 1) // 2])
+        agreeing = bisect_right(ordered, middle + settings.agreement) - bisect_left(ordered, middle - settings.agreement)
+        if agreeing < settings.fewest_rays:
             return _nothing(delay)
-        weights = falls if settings.average == "weighted" else [1.0] * len(speeds)
+        weights = falls if settings.average == "weighted" else [1.0] * count
         total = sum(weights)
         centre = middle if settings.average == "median" else sum(map(mul, weights, speeds)) / total
-        spread = math.sqrt(sum([w * (s - centre) ** 2 for w, s in zip(weights, speeds, strict=True)]) / total)
-        return SpeedEstimate(speed=centre, quality=spread, rays=len(speeds), valid=True, delay=delay)
+        squares = [(speed - centre) * (speed - centre) for speed in speeds]
+        spread = math.sqrt(sum(map(mul, weights, squares)) / total)
+        return SpeedEstimate(speed=centre, quality=spread, rays=count, valid=True, delay=delay)
 
 
 def _nothing(delay: float) -> SpeedEstimate:

@@ -53,9 +53,14 @@ class PulsePairWindow:
             return None
         return self._stamps_ns[0], self._stamps_ns[-1]
 
-    def sums(self) -> PulsePairs:
-        """The sums over the whole window."""
-        return PulsePairs(pairs=self._pairs.sum(axis=0), power=self._power.sum(axis=0), ranges=self._ranges)
+    def sums(self, nearest: float = 0.0, farthest: float = np.inf) -> PulsePairs:
+        """The sums over the whole window, for cells between two ranges (m)."""
+        first, last = np.searchsorted(self._ranges, (nearest, farthest)).tolist()
+        return PulsePairs(
+            pairs=self._pairs[:, first:last].sum(axis=0),
+            power=self._power[:, first:last].sum(axis=0),
+            ranges=self._ranges[first:last],
+        )
 
     def _push(self, scan: NDArray[np.complex64], stamp_ns: int) -> None:
         conjugate = scan.conj()

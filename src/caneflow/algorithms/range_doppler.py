@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import fft
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 
@@ -65,7 +64,7 @@ def range_doppler_map(
     Returns:
         Shape (M, transform); column k holds radial speed `speed_of_bin(k)`.
     """
-    spectra: NDArray[np.complex64] = fft(scans * weights, transform, axis=-1)
+    spectra: NDArray[np.complex64] = np.fft.fft(scans * weights, transform)
     return spectra
 
 
@@ -75,16 +74,23 @@ class SlowTimeWindow:
     def __init__(self, *, length: int, bins: int) -> None:
         """Empty: N = `length` scans of zeros."""
         self._length = length
-        self._twice = np.zeros((bins, 2 * length), dtype=np.complex64)
+        self._twice = np.zeros((2 * length, bins), dtype=np.complex64)
         self._next = 0
 
     def push(self, scan: NDArray[np.complex64]) -> None:
         """Let `scan`, shape (M,), take the place of the oldest."""
-        # Every scan is written twice, N columns apart: from any column on, the next N are the whole window.
-        self._twice[:, self._next] = scan
-        self._twice[:, self._next + self._length] = scan
+        # Every scan is written twice, N rows apart: from any row on, the next N are the whole window.
+        self._twice[self._next] = scan
+        self._twice[self._next + self._length] = scan
         self._next = (self._next + 1) % self._length
 
     def view(self) -> NDArray[np.complex64]:
         """All of it, shape (M, N), oldest first; valid until the next push."""
-        return self._twice[:, self._next : self._next + self._length]
+        return self._newest().T
+
+    def rows(self, bins: NDArray[np.intp]) -> NDArray[np.complex64]:
+        """Of K range `bins`, shape (K, N), oldest first."""
+        return self._newest().take(bins, axis=1).T
+
+    def _newest(self) -> NDArray[np.complex64]:
+        return self._twice[self._next : self._next + self._length]

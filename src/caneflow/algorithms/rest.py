@@ -43,9 +43,9 @@ def peaks_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, fl
     one side of zero only, so that at least a quarter of the axis holds noise alone.
     """
     standing = math.ceil(STANDING_CELLS * cell)
-    floor = np.sort(power)[len(power) // 4]
     half = len(power) // 2
-    return float(power[standing:half].max()), float(power[half : 1 - standing].max()), float(floor)
+    approaching, receding = np.maximum.reduce(power[standing:half]), np.maximum.reduce(power[half : 1 - standing])
+    return float(approaching), float(receding), float(np.sort(power)[len(power) // 4])
 
 
 def is_at_rest(peak: float, floor: float, turn_rate: float, settings: RestSettings) -> bool:

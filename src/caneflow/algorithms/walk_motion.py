@@ -8,7 +8,6 @@ The gyro's frame turns with the errors of the gyro; a turn of a degree in three 
 it does to the track is the business of heading_hypotheses.py.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -66,12 +65,10 @@ class WalkMotion:
         """Of position and velocity, (4, 4); a view."""
         return self._p[:4, :4]
 
-    def predict(
-        self, t: float, acceleration: tuple[float, float], cos_yaw: float, sin_yaw: float
-    ) -> tuple[float, float]:
+    def predict(self, t: float, acceleration: tuple[float, float], cos_yaw: float, sin_yaw: float) -> complex:
         """Go on by `t` s at a measured `acceleration` (m/s^2) in the gyro's frame; the boresight's yaw goes with it.
 
-        Returns the velocity gained, m/s.
+        Returns the velocity gained, m/s, as x + jy.
         """
         s, x = self._settings, self._x
         gained_x = t * (acceleration[0] - cos_yaw * x[_BF] + sin_yaw * x[_BL])
@@ -90,7 +87,7 @@ class WalkMotion:
         self._noise[_BF] = self._noise[_BL] = s.bias_walk**2 * t
         self._noise[_BETA] = s.pointing_walk**2 * t
         self._p.flat[::8] += self._noise
-        return gained_x, gained_y
+        return complex(gained_x, gained_y)
 
     def coast(self, t: float) -> None:
         """Go on by `t` s over which nothing was measured: the velocity holds, and is as unknown as at the start."""

@@ -213,7 +213,8 @@ class ZeroVelocity:
         noise[TILT] = settings.gyro_noise**2 * interval
         noise[GYRO_BIAS] = settings.gyro_bias_walk**2 * interval
         noise[ACCEL_BIAS] = settings.accel_bias_walk**2 * interval
-        self._covariance = step @ self._covariance @ step.T
+        covariance = step @ self._covariance @ step.T
+        self._covariance = 0.5 * (covariance + covariance.T)
         self._covariance.flat[:: STATES + 1] += noise
 
     def _forget(self, interval: float) -> None:
@@ -236,12 +237,12 @@ class ZeroVelocity:
     def _correct(self, seen: slice, residual: Vector, variance: float) -> None:
         """The Kalman filter's update by three of the states, each seen with a noise of `variance`; Joseph form."""
         p = self._covariance
-        noise = variance * np.eye(3)
-        gain = np.asarray(np.linalg.solve(p[seen, seen] + noise, p[seen, :]).T, dtype=np.float64)  # (STATES, 3)
-        kept = np.eye(STATES)
-        kept[:, seen] -= gain
-        corrected = kept @ p @ kept.T + gain @ noise @ gain.T
-        self._covariance = np.asarray(0.5 * (corrected + corrected.T), dtype=np.float64)
+        across = p[:, seen]  # (STATES, 3)
+        spread = p[seen, seen] + variance * np.eye(3)
+        gain = np.asarray(np.linalg.solve(spread, across.T).T, dtype=np.float64)
+        lost = gain @ across.T
+        # (I - K H) P (I - K H)' + K R K', multiplied out: H only picks columns
+        self._covariance = p - lost - lost.T + gain @ spread @ gain.T
         self._apply((gain @ np.array(residual)).tolist())
 
     def _apply(self, error: list[float]) -> None:

@@ -10,12 +10,20 @@ class PortMark(msgspec.Struct, frozen=True, array_like=True, gc=False):
     watermark: int  # ns: no sample with a stamp at or before it will be sent any more
 
 
+class Again(msgspec.Struct, frozen=True, gc=False):
+    """The end of a writer's answer to a reader that asked for samples again."""
+
+    first: int  # seq of the oldest sample that the writer still has: what lies before it is lost
+    mark: PortMark
+
+
 class Progress(msgspec.Struct, frozen=True, gc=False):
     """`@/progress/<node>`: how far a node has come. Sent when it is idle, and under load regularly."""
 
     node: str
     handled: int  # ns: everything up to this stamp has been handled
     ports: dict[str, PortMark]
+    confirmed: dict[str, int] = {}  # by input key the last seq that this node will not ask for again
 
 
 class Window(msgspec.Struct, frozen=True, gc=False):

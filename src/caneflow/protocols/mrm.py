@@ -20,19 +20,27 @@ LONGEST_SCAN = 16_416  # samples of the widest window the radar accepts, -499998
 SCAN_COUNT_STOP = 0
 SCAN_COUNT_FOREVER = 65535
 STATUS_OK = 0
+STATUS_FAILURE = 1
+STATUS_WRONG_MODE = 2
+STATUS_UNSUPPORTED = 3
+STATUS_ASLEEP = 4
 STATUS_NAMES = {
-    0: "ok",
-    1: "failure",
-    2: "wrong operation mode",
-    3: "unsupported value",
-    4: "invalid during sleep",
+    STATUS_OK: "ok",
+    STATUS_FAILURE: "failure",
+    STATUS_WRONG_MODE: "wrong operation mode",
+    STATUS_UNSUPPORTED: "unsupported value",
+    STATUS_ASLEEP: "invalid during sleep",
 }
+MODE_MRM = 1  # operation mode: monostatic radar
+SLEEP_ACTIVE = 0  # sleep mode: awake
 
 _TYPE_AND_ID = struct.Struct(">HH")
 _CONFIG = struct.Struct(">IiiHH4H4BBBBB")
 _CONFIG_TAIL = struct.Struct(">II")
 _CONTROL = struct.Struct(">HHI")
 _STATUS = struct.Struct(">I")
+_MODE = struct.Struct(">I")
+_MODE_AND_STATUS = struct.Struct(">II")
 _SCAN = struct.Struct(">II16siiHBxBBHIHH")
 _INFO = struct.Struct(">BBHBBHBBBBIBBBBi")
 _PACKAGE = struct.Struct(">32s")
@@ -119,6 +127,22 @@ class _Confirm:
 
     def body(self) -> bytes:
         return _pack(_STATUS, type(self).__name__, self.status)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _ModeRequest:
+    """Asks for a mode."""
+
+    message_id: int
+    mode: int
+
+    @classmethod
+    def read(cls, message_id: int, data: bytes) -> Self:
+        (mode,) = _unpack(_MODE, data, 4, cls.__name__)
+        return cls(message_id=message_id, mode=mode)
+
+    def body(self) -> bytes:
+        return _pack(_MODE, type(self).__name__, self.mode)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -264,6 +288,48 @@ class GetStatusConfirm:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class SetOperationModeRequest(_ModeRequest):
+    """Asks the radar to become another kind of device: MODE_MRM, or a ranging radio."""
+
+    CODE: ClassVar[int] = 0xF003
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SetOperationModeConfirm:
+    """The operation mode in force, and whether it is the one that was asked for."""
+
+    CODE: ClassVar[int] = 0xF103
+
+    message_id: int
+    mode: int
+    status: int = STATUS_OK
+
+    @classmethod
+    def read(cls, message_id: int, data: bytes) -> Self:
+        """The answer in `data`."""
+        mode, status = _unpack(_MODE_AND_STATUS, data, 4, cls.__name__)
+        return cls(message_id=message_id, mode=mode, status=status)
+
+    def body(self) -> bytes:
+        """What follows type and id."""
+        return _pack(_MODE_AND_STATUS, type(self).__name__, self.mode, self.status)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SetSleepModeRequest(_ModeRequest):
+    """Asks the radar to wake (SLEEP_ACTIVE) or to sleep in one of four depths."""
+
+    CODE: ClassVar[int] = 0xF005
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SetSleepModeConfirm(_Confirm):
+    """Whether the radar woke, or fell asleep."""
+
+    CODE: ClassVar[int] = 0xF105
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class ReadyInfo(_Bare):
     """Sent unasked after power-up, reboot or waking: the radar has forgotten that it was scanning."""
 
@@ -360,6 +426,10 @@ Message: TypeAlias = (
     | ControlConfirm
     | GetStatusRequest
     | GetStatusConfirm
+    | SetOperationModeRequest
+    | SetOperationModeConfirm
+    | SetSleepModeRequest
+    | SetSleepModeConfirm
     | ReadyInfo
     | ScanInfo
 )

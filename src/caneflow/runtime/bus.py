@@ -6,7 +6,8 @@ Zenoh's threads only put things into the inbox; what they mean is decided on the
 import logging
 import queue
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from types import TracebackType
 from typing import TypeAlias, TypeVar
 
@@ -14,7 +15,7 @@ import msgspec
 import zenoh
 
 from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, encode
-from caneflow.messages.control import Counters, LeftOut, PortMark, Progress, Window
+from caneflow.messages.control import Again, Counters, LeftOut, PortMark, Progress, Window
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.links import open_session
 from caneflow.runtime.plan import InputPlan, NodePlan
@@ -23,6 +24,8 @@ log = logging.getLogger(__name__)
 
 C = TypeVar("C", bound=msgspec.Struct)
 
+AGAIN = "caneflow.Again/1"
+ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 POLL = 0.01  # s between two looks at a condition that Zenoh does not signal
 
 
@@ -32,6 +35,7 @@ class Arrived(msgspec.Struct, frozen=True, gc=False):
     port: str
     payload: bytes
     schema: str  # "" when the writer did not say
+    again: bool = False  # it was asked for
 
 
 class Marked(msgspec.Struct, frozen=True, gc=False):
@@ -39,6 +43,30 @@ class Marked(msgspec.Struct, frozen=True, gc=False):
 
     port: str
     mark: PortMark
+
+
+class Answered(msgspec.Struct, frozen=True, gc=False):
+    """A writer has sent again what it still has of a stream."""
+
+    port: str
+    first: int  # seq of the oldest sample that it still has
+    mark: PortMark
+
+
+class Asked(msgspec.Struct, frozen=True, gc=False):
+    """A reader asks for samples of an output port again."""
+
+    port: str
+    first: int  # seq of the first one it wants
+    query: zenoh.Query
+
+
+class Confirmed(msgspec.Struct, frozen=True, gc=False):
+    """A reader will not ask for a sample or any before it."""
+
+    port: str  # of this node
+    reader: str
+    seq: int
 
 
 class Noted(msgspec.Struct, frozen=True, gc=False):
@@ -63,7 +91,7 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
 
 
 Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
-Event: TypeAlias = Arrived | Noted | Marked | Started | Opened | Stopped
+Event: TypeAlias = Arrived | Answered | Asked | Confirmed | Noted | Marked | Started | Opened | Stopped
 
 
 class Bus:
@@ -115,6 +143,25 @@ class Bus:
         """Whether the inbox holds anything."""
         return not self._inbox.empty()
 
+    def ask_again(self, port: str, first: int) -> None:
+        """Ask the writer of an input for its samples from seq `first` on; they come as events, then Answered."""
+        wire = self._plan.inputs[port]
+        key = control_key(self._plan.flow, "history", wire.writer, wire.key.rpartition("/")[2])
+        handler = zenoh.handlers.Callback(self._on_reply(port), indirect=False)
+        # Without this Zenoh keeps only the last of several replies under one key.
+        every = zenoh.ConsolidationMode.NONE
+        self._session.get(key, handler, payload=str(first), timeout=ANSWER_TIMEOUT, consolidation=every)
+
+    def answer(self, asked: Asked, payloads: Iterable[bytes], end: Again) -> None:
+        """Send samples again to the one who asked."""
+        out = self._plan.outputs[asked.port]
+        key = control_key(self._plan.flow, "history", self._plan.node, asked.port)
+        encoding = zenoh.Encoding(MEDIA_TYPE).with_schema(out.schema)
+        with asked.query as query:
+            for payload in payloads:
+                query.reply(key, payload, encoding=encoding)
+            query.reply(key, encode(end), encoding=zenoh.Encoding(MEDIA_TYPE).with_schema(AGAIN))
+
     def send(self, port: str, payload: bytes) -> None:
         """Publish a sample's bytes on an output port."""
         self._publishers[port].put(payload)
@@ -139,7 +186,13 @@ class Bus:
             by_writer.setdefault(wire.writer, {})[wire.key.rpartition("/")[2]] = port
         for writer, ports in by_writer.items():
             self._subscribe(control_key(plan.flow, "progress", writer), self._on_progress(ports))
-            self._answer(control_key(plan.flow, "edge", writer, plan.node))
+            # That a writer's question arrives here shows that this side's subscriptions arrived there.
+            key = control_key(plan.flow, "edge", writer, plan.node)
+            self._answer_with(key, partial(_say_yes, key))
+        for port, out in plan.outputs.items():
+            self._answer_with(control_key(plan.flow, "history", plan.node, port), self._on_asked(port))
+            for reader in out.readers:
+                self._subscribe(control_key(plan.flow, "progress", reader), self._on_confirmed(port, reader, out.key))
         self._subscribe(control_key(plan.flow, "start"), lambda _: self._inbox.put(Started()))
         if plan.replay:
             self._subscribe(control_key(plan.flow, "window"), self._on_window)
@@ -151,14 +204,9 @@ class Bus:
         handler = zenoh.handlers.Callback(callback, indirect=False)
         self._held.append(self._session.declare_subscriber(key, handler))
 
-    def _answer(self, key: str) -> None:
-        """Answer a writer's question on `key`: that its question arrives shows that this side's wishes did."""
-
-        def reply(query: zenoh.Query) -> None:
-            with query:
-                query.reply(key, b"")
-
-        self._held.append(self._session.declare_queryable(key, reply))
+    def _answer_with(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
+        handler = zenoh.handlers.Callback(callback, indirect=False)
+        self._held.append(self._session.declare_queryable(key, handler))
 
     def _wait_for_reader(self, reader: str) -> None:
         key = control_key(self._plan.flow, "edge", self._plan.node, reader)
@@ -188,6 +236,34 @@ class Bus:
 
         return put
 
+    def _on_reply(self, port: str) -> Callable[[zenoh.Reply], None]:
+        def put(reply: zenoh.Reply) -> None:
+            if reply.ok is None:
+                return
+            schema = str(reply.ok.encoding).rpartition(";")[2]
+            if schema != AGAIN:
+                self._inbox.put(Arrived(port, reply.ok.payload.to_bytes(), schema, again=True))
+            elif end := _control(reply.ok, Again):
+                self._inbox.put(Answered(port, end.first, end.mark))
+
+        return put
+
+    def _on_asked(self, port: str) -> Callable[[zenoh.Query], None]:
+        def put(query: zenoh.Query) -> None:
+            first = query.payload.to_string() if query.payload is not None else ""
+            if first.isascii() and first.isdigit():
+                self._inbox.put(Asked(port, int(first), query))
+
+        return put
+
+    def _on_confirmed(self, port: str, reader: str, key: str) -> Callable[[zenoh.Sample], None]:
+        def put(sample: zenoh.Sample) -> None:
+            progress = _control(sample, Progress)
+            if progress and key in progress.confirmed:
+                self._inbox.put(Confirmed(port, reader, progress.confirmed[key]))
+
+        return put
+
     def _on_progress(self, ports: dict[str, str]) -> Callable[[zenoh.Sample], None]:
         def put(sample: zenoh.Sample) -> None:
             progress = _control(sample, Progress)
@@ -204,6 +280,11 @@ class Bus:
         window = _control(sample, Window)
         if window:
             self._inbox.put(Opened(window.until))
+
+
+def _say_yes(key: str, query: zenoh.Query) -> None:
+    with query:
+        query.reply(key, b"")
 
 
 def check_schema(arrived: Arrived, wire: InputPlan) -> None:

@@ -243,16 +243,22 @@ def _recorder(
 
 
 def _with_readers(plan: NodePlan, plans: dict[str, NodePlan], rig: dict[str, Any], replay: bool) -> NodePlan:
-    readers = tuple(
-        other.node for other in plans.values() if any(wire.writer == plan.node for wire in other.inputs.values())
-    )
+    outputs = {
+        port: msgspec.structs.replace(
+            out,
+            readers=tuple(
+                other.node for other in plans.values() if any(wire.key == out.key for wire in other.inputs.values())
+            ),
+        )
+        for port, out in plan.outputs.items()
+    }
     inputs = plan.inputs
     if replay:  # nothing may be lost, and nobody has a clock to lag behind: the sources wait instead
         inputs = {
             port: msgspec.structs.replace(wire, length=None, max_lag_ms=None, max_age_ms=None)
             for port, wire in plan.inputs.items()
         }
-    return msgspec.structs.replace(plan, readers=readers, rig=rig, replay=replay, inputs=inputs)
+    return msgspec.structs.replace(plan, outputs=outputs, rig=rig, replay=replay, inputs=inputs)
 
 
 def program_arguments(plan: NodePlan) -> Sequence[str]:

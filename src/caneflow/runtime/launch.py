@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
+import msgspec
 import zenoh
 
 from caneflow.messages import MessageError, control_key, decode, encode
 from caneflow.messages.control import Counters, Progress, Window
-from caneflow.runtime.deployment import Deployment, linked, program_arguments
+from caneflow.runtime.deployment import REPLAYER_MODULE, Deployment, linked, program_arguments
 from caneflow.runtime.graph import Restart
 from caneflow.runtime.links import Ports, open_session
 from caneflow.runtime.merge import BEGIN, END
@@ -65,6 +66,7 @@ class NodeState:
     started_at: float = 0.0  # s, monotonic
     restart_at: float = 0.0  # s, monotonic
     restarts: int = 0
+    restarted: list[float] = field(default_factory=list)  # s, monotonic: the restarts within the policy's window
     handled: int = BEGIN
     counters: Counters | None = None
     last_line: str = ""
@@ -95,6 +97,7 @@ class Launcher:
         self._deployment = deployment
         self._nodes: dict[str, NodeState] = {}
         self._barrier_passed = False
+        self._started_s = 0.0  # monotonic
         self._until = BEGIN
         self._outcome = Outcome()
 
@@ -196,6 +199,7 @@ class Launcher:
         node.state = "ready"
         if not self._barrier_passed and all(other.state == "ready" for other in self._nodes.values()):
             self._barrier_passed = True
+            self._started_s = time.monotonic()
         if self._barrier_passed:
             self._say_start()
 
@@ -207,23 +211,30 @@ class Launcher:
 
     def _restart_or_fail(self, node: NodeState, cause: str) -> None:
         name, policy = node.plan.node, node.restart
-        if policy.policy == "never" or node.restarts >= policy.max_restarts:
+        now = time.monotonic()
+        node.restarted = [moment for moment in node.restarted if now - moment < policy.window_s]
+        if policy.policy == "never" or len(node.restarted) >= policy.max_restarts:
             node.state = "failed"
             tried = f" after {node.restarts} restarts" if node.restarts else ""
             said = f": {node.last_line}" if node.last_line else ""
             self._outcome.failures.append(f"{name} {cause}{tried}{said}")
             return
-        delay = min(policy.delay_s * 2**node.restarts, policy.max_delay_s)
+        delay = min(policy.delay_s * 2 ** len(node.restarted), policy.max_delay_s)
         node.restarts += 1
+        node.restarted.append(now)
         node.state = "waiting"
-        node.restart_at = time.monotonic() + delay
-        self._report(name, f"{cause}; restart {node.restarts} of {policy.max_restarts} in {delay:g} s")
+        node.restart_at = now + delay
+        self._report(name, f"{cause}; restart {len(node.restarted)} of {policy.max_restarts} in {delay:g} s")
 
     # --- what goes out ----------------------------------------------------------------------------------------
 
     def _start(self, node: NodeState) -> None:
         path = self._directory.path / f"{node.plan.node}.json"
-        node.plan.write(path)
+        plan = node.plan
+        if self._barrier_passed and plan.module == REPLAYER_MODULE:
+            settings = {**plan.settings, "started_s": self._started_s}
+            plan = msgspec.structs.replace(plan, settings=settings)
+        plan.write(path)
         node.state = "starting"
         node.started_at = time.monotonic()
         node.pid = self._processes.start(node.plan.node, program_arguments(node.plan), path)

@@ -11,19 +11,37 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import MessageError, Sample, decode, numbered
-from caneflow.messages.control import Counters, Progress
+from caneflow.messages.control import Again, Counters, Progress
 from caneflow.messages.rig import read_rig
-from caneflow.runtime.bus import Arrived, Bus, Event, Marked, Noted, Opened, Started, Stopped, check_schema
+from caneflow.runtime.bus import (
+    Answered,
+    Arrived,
+    Asked,
+    Bus,
+    Confirmed,
+    Event,
+    Marked,
+    Noted,
+    Opened,
+    Started,
+    Stopped,
+    check_schema,
+)
 from caneflow.runtime.feed import Feed
+from caneflow.runtime.history import History
 from caneflow.runtime.merge import BEGIN, END
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.programs import validated_settings
 from caneflow.runtime.seeds import generator
+from caneflow.runtime.snapshot_keeper import SnapshotKeeper
 from caneflow.runtime.stage import Stage
 from caneflow.runtime.tap import Tap
 
@@ -31,14 +49,18 @@ log = logging.getLogger(__name__)
 
 REPORT_PERIOD = 0.02  # s between two progress marks under load
 COUNTERS_PERIOD = 1.0  # s
-MISSING_AFTER = 2.0  # s after which a sample that was sent and has not come is lost
+ASK_PERIOD = 0.3  # s between two requests for samples that have not come
+LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run
+REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
+SNAPSHOT_PERIOD = 0.5  # s between two snapshots of an operator
 
 
 def run(program: Program) -> None:
     """Run `program` as the node that the plan on the command line describes; the process ends with it."""
     logging.basicConfig(format="%(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
     try:
-        sys.exit(_run(program, NodePlan.read(Path(sys.argv[1]))))
+        path = Path(sys.argv[1])
+        sys.exit(_run(program, NodePlan.read(path), path.with_suffix(".snapshot")))
     except IndexError:
         sys.exit(f"usage: {sys.argv[0]} PLAN; a node is started by `caneflow run`")
     except CaneflowError as error:
@@ -55,7 +77,7 @@ def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
     return program(settings, Context(node=plan.node, rig=read_rig(plan.rig), ports=kinds, random=random))
 
 
-def _run(program: Program, plan: NodePlan) -> int:
+def _run(program: Program, plan: NodePlan, snapshots: Path) -> int:
     built = build(program, plan)
     with Bus(plan) as bus:
         signal.signal(signal.SIGINT, lambda *_: None)  # the launcher decides when a node ends
@@ -66,7 +88,7 @@ def _run(program: Program, plan: NodePlan) -> int:
         if isinstance(built, Sink):
             _SinkNode(plan, bus, built).run()
         else:
-            _OperatorNode(plan, bus, built).run()
+            _OperatorNode(plan, bus, built, snapshots).run()
     return 0
 
 
@@ -95,6 +117,14 @@ class _Reports:
             self._next_counters = time.monotonic() + COUNTERS_PERIOD
 
 
+@dataclass
+class _Missing:
+    """Samples that were sent and have not come."""
+
+    since: float  # s, monotonic
+    ask_at: float = 0.0  # s, monotonic
+
+
 class _ReaderNode(ABC):
     """What a node with inputs does on a bus, whether operator or sink."""
 
@@ -104,7 +134,9 @@ class _ReaderNode(ABC):
         self.reader = reader
         self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else 5 * REPORT_PERIOD)
         self.stopped = False
-        self._missing_since: dict[str, float] = {}
+        self._missing: dict[str, _Missing] = {}
+        for arrivals in reader.inputs.values():
+            arrivals.patient = True
 
     def take_events(self, timeout: float) -> bool:
         """Take what came, waiting up to `timeout` s for it; whether anything came."""
@@ -118,6 +150,10 @@ class _ReaderNode(ABC):
         match event:
             case Arrived():
                 self.take_sample(event)
+            case Answered():
+                self.reader.mark(event.port, event.mark)
+                if event.first > self.reader.inputs[event.port].expected:
+                    self.skip_to(event.port, event.first)  # the writer does not have what lies before it any more
             case Marked():
                 self.reader.mark(event.port, event.mark)
             case Noted() if isinstance(self.reader, Tap):
@@ -141,14 +177,24 @@ class _ReaderNode(ABC):
     def take_message(self, arrived: Arrived, message: Sample) -> None:
         """Take a sample that could be decoded."""
 
-    def give_up_missing(self) -> None:
-        """Take samples as lost that were sent and have not come for long: their mark must not wait for ever."""
+    def ask_for_missing(self) -> None:
+        """Ask for samples that were sent and have not come; after long enough, go on without them."""
         now = time.monotonic()
         for port, arrivals in self.reader.inputs.items():
-            if arrivals.mark is None:
-                self._missing_since.pop(port, None)
-            elif now - self._missing_since.setdefault(port, now) > MISSING_AFTER:
-                self.reader.give_up(port)
+            before = arrivals.missing_before
+            if before is None:
+                self._missing.pop(port, None)
+                continue
+            missing = self._missing.setdefault(port, _Missing(since=now))
+            if now - missing.since > (REPLAY_PATIENCE if self.plan.replay else LIVE_PATIENCE):
+                self.skip_to(port, before)
+            elif now >= missing.ask_at:
+                self.bus.ask_again(port, arrivals.expected)
+                missing.ask_at = now + ASK_PERIOD
+
+    @abstractmethod
+    def skip_to(self, port: str, seq: int) -> None:
+        """Go on without the samples before `seq`."""
 
     def count(self, outputs: dict[str, int], *, at_once: bool = False) -> None:
         counters = Counters(node=self.plan.node, inputs=self.reader.input_counts(), outputs=outputs)
@@ -156,39 +202,97 @@ class _ReaderNode(ABC):
 
 
 class _OperatorNode(_ReaderNode):
-    def __init__(self, plan: NodePlan, bus: Bus, operator: Operator) -> None:
+    def __init__(self, plan: NodePlan, bus: Bus, operator: Operator, snapshots: Path) -> None:
         self.stage = Stage(plan.node, operator, plan.inputs, plan.outputs)
         super().__init__(plan, bus, self.stage)
+        self.history = History({port: out.readers for port, out in plan.outputs.items()})
+        self.keeper = SnapshotKeeper(snapshots, operator)
+        self.confirmed: dict[str, int] = {}  # by input key what the last snapshot has handled
+        self._next_snapshot = time.monotonic() + SNAPSHOT_PERIOD
         # Live: for each input that may lag, when the samples of the others came, and their stamps.
         self._others: dict[str, deque[tuple[float, int]]] = {
             port: deque() for port, wire in plan.inputs.items() if wire.max_lag_ms is not None and not plan.replay
         }
 
     def run(self) -> None:
+        resumed = self.resume()
         self.bus.declare_ready()
+        if resumed:
+            self.send_again()
         while not self.stopped:
             self.take_events(timeout=REPORT_PERIOD)
             self.handle_what_is_due()
-            self.give_up_missing()
+            self.ask_for_missing()
             self.wait_no_longer_than_allowed()
             self.report()
         self.count(self.sent(), at_once=True)
+
+    def take(self, event: Event) -> None:
+        match event:
+            case Confirmed():
+                self.history.confirm(event.port, event.reader, event.seq)
+            case Asked():
+                mark = self.stage.progress().ports[event.port]
+                end = Again(self.history.first(event.port), mark)
+                self.bus.answer(event, self.history.since(event.port, event.first), end)
+            case _:
+                super().take(event)
 
     def take_message(self, arrived: Arrived, message: Sample) -> None:
         for port, others in self._others.items():
             if port != arrived.port:
                 others.append((time.monotonic(), message.stamp))
-        self.stage.offer(arrived.port, message)
+        self.stage.offer(arrived.port, message, again=arrived.again)
+
+    def skip_to(self, port: str, seq: int) -> None:
+        self.stage.skip_to(port, seq)
 
     def handle_what_is_due(self) -> None:
         now = None if self.plan.replay else time.time_ns()
         while (emitted := self.stage.step(now)) is not None:
             for port, message, seq in emitted:
-                self.bus.send(port, numbered(message, seq))
+                payload = numbered(message, seq)
+                self.history.keep(port, seq, payload)
+                self.bus.send(port, payload)
             if self.reports.due():
-                self.reports.progress(self.stage.progress())
+                self.reports.progress(self.progress())
+                self.keep_snapshot()
             if self.bus.pending():
                 self.take_events(timeout=0)
+
+    def progress(self) -> Progress:
+        """How far the node has come, and what its readers' writers may forget."""
+        return msgspec.structs.replace(self.stage.progress(), confirmed=self.confirmed)
+
+    def keep_snapshot(self) -> None:
+        """Now and then: what a new process in this one's place needs to go on."""
+        if time.monotonic() < self._next_snapshot:
+            return
+        self._next_snapshot = time.monotonic() + SNAPSHOT_PERIOD
+        handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
+        if handled != self.confirmed:
+            self.keeper.keep(self.stage.state(), self.history.kept())
+            self.confirmed = handled
+
+    def resume(self) -> bool:
+        """Go on where a process before this one was killed; whether there was one."""
+        kept = self.keeper.resume()
+        if kept is None:
+            return False
+        self.stage.resume(kept.stage)
+        for port, samples in kept.history.items():
+            for seq, payload in samples:
+                self.history.keep(port, seq, payload)
+        self.confirmed = {self.plan.inputs[port].key: seq for port, (seq, _) in kept.stage.inputs.items()}
+        return True
+
+    def send_again(self) -> None:
+        """Send what readers may not have got before the kill, and ask for what came since the snapshot."""
+        for port, samples in self.history.kept().items():
+            for kept in samples:
+                self.bus.send(port, kept.payload)
+        for port, arrivals in self.stage.inputs.items():
+            self.bus.ask_again(port, arrivals.expected)
 
     def wait_no_longer_than_allowed(self) -> None:
         """Live: go on without an input that holds up what came longer than its max_lag_ms ago."""
@@ -205,7 +309,8 @@ class _OperatorNode(_ReaderNode):
     def report(self) -> None:
         for note in self.stage.left_out():
             self.bus.send_left_out(note)
-        progress = self.stage.progress()
+        self.keep_snapshot()
+        progress = self.progress()
         if self.stage.finished or self.stage.tells_more_than_samples() or self.reports.due():
             if self.stage.finished:
                 self.count(self.sent(), at_once=progress != self.reports.said)
@@ -227,7 +332,7 @@ class _SinkNode(_ReaderNode):
             while not self.stopped:
                 if not self.take_events(timeout=REPORT_PERIOD):
                     self.tap.idle(time.time_ns())
-                self.give_up_missing()
+                self.ask_for_missing()
                 if self.tap.ended and not self.tap.finished:
                     self.tap.finish()
                     self.count({}, at_once=True)
@@ -239,7 +344,10 @@ class _SinkNode(_ReaderNode):
         self.count({}, at_once=True)
 
     def take_message(self, arrived: Arrived, message: Sample) -> None:
-        self.tap.offer(arrived.port, message, arrived.payload, time.time_ns())
+        self.tap.offer(arrived.port, message, arrived.payload, time.time_ns(), again=arrived.again)
+
+    def skip_to(self, port: str, seq: int) -> None:
+        self.tap.skip_to(port, seq, time.time_ns())
 
 
 class _Ended(BaseException):
@@ -252,25 +360,30 @@ class _SourceNode:
         self.bus = bus
         self.source = source
         self.feed = Feed(plan.node, plan.outputs, ordered=source.ordered)
+        self.history = History({port: out.readers for port, out in plan.outputs.items()})
         self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else 5 * REPORT_PERIOD)
         self.started = False
+        self.stopped = False
         self.until = BEGIN if plan.replay else END  # how far a replay may send
 
     def run(self) -> None:
         try:
-            with _ended_by_sigterm():
+            with self.ended_by_sigterm():
                 self.bus.declare_ready()
-                while not self.started:
+                while not (self.started or self.stopped):
                     self.take_events(timeout=None)
                 self.send_all()
                 self.end()
         except _Ended:
-            self.count(at_once=True)
+            pass
+        self.count(at_once=True)
 
     def send_all(self) -> None:
         samples = self.source.samples()
         try:
             for item in samples:
+                if self.stopped:
+                    return
                 if isinstance(item, Quiet):
                     self.feed.nothing_until(item.until)
                     self.reports.progress(self.feed.progress())
@@ -279,6 +392,7 @@ class _SourceNode:
                 self.wait_for_window(sample.stamp)
                 payload = self.feed.take(port, sample)
                 if payload is not None:
+                    self.history.keep(port, self.feed.outputs[port].sent - 1, payload)
                     self.bus.send(port, payload)
                 if self.reports.due():
                     self.reports.progress(self.feed.progress())
@@ -290,7 +404,7 @@ class _SourceNode:
         """Hold a replay's sample back until the readers have come near enough."""
         if self.bus.pending():
             self.take_events(timeout=0)
-        while stamp > self.until:
+        while stamp > self.until and not self.stopped:
             self.feed.nothing_until(stamp - 1)
             self.reports.progress(self.feed.progress())
             self.take_events(timeout=None)
@@ -302,6 +416,11 @@ class _SourceNode:
                     self.started = True
                 case Opened():
                     self.until = max(self.until, event.until)
+                case Confirmed():
+                    self.history.confirm(event.port, event.reader, event.seq)
+                case Asked():
+                    end = Again(self.history.first(event.port), self.feed.progress().ports[event.port])
+                    self.bus.answer(event, self.history.since(event.port, event.first), end)
                 case _:
                     pass  # a source has no inputs
 
@@ -310,22 +429,25 @@ class _SourceNode:
         self.feed.ended = True
         self.count(at_once=True)
         self.reports.progress(self.feed.progress())
-        while True:
+        while not self.stopped:
             self.take_events(timeout=None)
+
+    @contextmanager
+    def ended_by_sigterm(self) -> Iterator[None]:
+        """Let SIGTERM end the source, out of a blocked read as well."""
+
+        def end(*_: object) -> None:
+            self.stopped = True
+            self.bus.put(Stopped())  # an exception that is raised inside a destructor is lost: the event is not
+            raise _Ended
+
+        before = signal.signal(signal.SIGTERM, end)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGTERM, before)
 
     def count(self, *, at_once: bool = False) -> None:
         sent = {port: out.sent for port, out in self.feed.outputs.items()}
         counters = Counters(node=self.plan.node, inputs={}, outputs=sent, refused=self.feed.refused)
         self.reports.counters(counters, at_once=at_once)
-
-
-@contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    def end(*_: object) -> None:
-        raise _Ended
-
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -37,6 +37,7 @@ class OutputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     key: str
     schema: str
+    readers: tuple[str, ...] = ()  # the nodes that read it, the recorder among them
 
     @cached_property
     def kind(self) -> type[Sample]:
@@ -65,9 +66,13 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
     inputs: dict[str, InputPlan] = {}
     outputs: dict[str, OutputPlan] = {}
     hears_notes: bool = False  # a recorder also takes what nodes say they left out
-    readers: tuple[str, ...] = ()  # the nodes that read an output, the recorder among them
     links: Links = Links()
     ready_timeout_s: float = 20.0
+
+    @property
+    def readers(self) -> tuple[str, ...]:
+        """The nodes that read an output."""
+        return tuple(dict.fromkeys(reader for out in self.outputs.values() for reader in out.readers))
 
     def write(self, path: Path) -> None:
         """Store the plan for the node's process."""

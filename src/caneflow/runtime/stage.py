@@ -6,6 +6,8 @@ emits is numbered. Nothing here knows Zenoh, processes or a clock.
 
 from collections.abc import Iterator, Mapping
 
+import msgspec
+
 from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, LeftOut, PortMark, Progress
 from caneflow.runtime.errors import DataflowError
@@ -13,6 +15,14 @@ from caneflow.runtime.merge import END, Merge
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.program import Emitted, Operator, Refused
 from caneflow.runtime.streams import Arrivals, Departures
+
+
+class StageState(msgspec.Struct, frozen=True):
+    """Where the streams of a stage stand."""
+
+    inputs: dict[str, tuple[int, int]]  # by port the seq and stamp (ns) of the last sample handled
+    outputs: dict[str, tuple[int, int]]  # by port how many were sent, and the last one's stamp (ns)
+    finished: bool
 
 
 class Stage:
@@ -28,21 +38,11 @@ class Stage:
         self._operator = operator
         self._merge = Merge(tuple(inputs))
 
-    def offer(self, port: str, message: Sample) -> None:
-        """Take a decoded sample that arrived on `port`."""
+    def offer(self, port: str, message: Sample, *, again: bool = False) -> None:
+        """Take a decoded sample that arrived on `port`; `again`: it was asked for, and may have come before."""
         arrivals = self.inputs[port]
-        arrivals.counts.received += 1
-        if not arrivals.admit(message):
-            return
-        if message.stamp in arrivals.plan.left_out_stamps:
-            arrivals.counts.left_out += 1
-            self._merge.advance(port, message.stamp)
-        elif message.stamp <= self._merge.watermark(port):
-            arrivals.counts.late += 1
-            arrivals.leave_out(message, "late")
-        else:
-            self._merge.push(port, message)
-            self._keep_length(port, arrivals)
+        for each in arrivals.admit(message, again=again):
+            self._queue(port, arrivals, each)
         self._count_mark(port, arrivals)
 
     def refuse(self, port: str, error: MessageError) -> None:
@@ -50,10 +50,12 @@ class Stage:
         self.inputs[port].refuse_unreadable(error)
         self._count_mark(port, self.inputs[port])
 
-    def give_up(self, port: str) -> None:
-        """Stop waiting for samples of `port` that were sent and did not arrive."""
-        self.inputs[port].give_up()
-        self._count_mark(port, self.inputs[port])
+    def skip_to(self, port: str, seq: int) -> None:
+        """Stop waiting for samples of `port` before `seq` that were sent and did not arrive."""
+        arrivals = self.inputs[port]
+        for each in arrivals.skip_to(seq):
+            self._queue(port, arrivals, each)
+        self._count_mark(port, arrivals)
 
     def mark(self, port: str, mark: PortMark) -> None:
         """Take the writer's word on how far the stream of `port` has come."""
@@ -82,6 +84,7 @@ class Stage:
         if due is not None:
             port, message = due
             arrivals = self.inputs[port]
+            arrivals.note_handled(message)
             if now is not None and arrivals.too_old(message, now):
                 arrivals.counts.dropped += 1
                 arrivals.leave_out(message, "dropped")
@@ -98,6 +101,25 @@ class Stage:
         handled = END if self.finished else min(self._merge.handled(), END - 1)
         marks = {port: PortMark(out.sent - 1, handled) for port, out in self.outputs.items()}
         return Progress(self.node, handled, marks)
+
+    def state(self) -> StageState:
+        """Where the streams stand, between two samples."""
+        return StageState(
+            inputs={port: (each.handled_seq, each.handled_stamp) for port, each in self.inputs.items()},
+            outputs={port: (out.sent, out.last_stamp) for port, out in self.outputs.items()},
+            finished=self.finished,
+        )
+
+    def resume(self, state: StageState) -> None:
+        """Go on where `state` was taken; what had come and was not handled has to come again."""
+        for port, (seq, stamp) in state.inputs.items():
+            arrivals = self.inputs[port]
+            arrivals.handled_seq, arrivals.handled_stamp = seq, stamp
+            arrivals.expected, arrivals.last_stamp = seq + 1, stamp
+            self._merge.advance(port, stamp)
+        for port, (sent, stamp) in state.outputs.items():
+            self.outputs[port].sent, self.outputs[port].last_stamp = sent, stamp
+        self.finished = state.finished
 
     def tells_more_than_samples(self) -> bool:
         """Whether a reader cannot see from the samples alone how far this node has come."""
@@ -116,6 +138,20 @@ class Stage:
         for port, arrivals in self.inputs.items():
             arrivals.counts.waiting = self._merge.waiting(port)
         return {port: arrivals.counts for port, arrivals in self.inputs.items()}
+
+    def _queue(self, port: str, arrivals: Arrivals, message: Sample) -> None:
+        """Let a sample that is next in its stream wait for its turn in event time."""
+        if message.stamp in arrivals.plan.left_out_stamps:
+            arrivals.counts.left_out += 1
+            arrivals.note_handled(message)
+            self._merge.advance(port, message.stamp)
+        elif message.stamp <= self._merge.watermark(port):
+            arrivals.counts.late += 1
+            arrivals.note_handled(message)
+            arrivals.leave_out(message, "late")
+        else:
+            self._merge.push(port, message)
+            self._keep_length(port, arrivals)
 
     def _handled(self, port: str, message: Sample) -> Emitted:
         try:

@@ -1,6 +1,7 @@
 """Streams at a node's edge: what arrives is held against its number and stamp, what departs is numbered."""
 
 import logging
+from collections import deque
 from dataclasses import dataclass, field
 
 from caneflow.messages import MessageError, Sample
@@ -11,6 +12,8 @@ from caneflow.runtime.plan import InputPlan, OutputPlan
 
 log = logging.getLogger(__name__)
 
+NOTES_KEPT = 10_000  # per stream, until a live host has told them
+AHEAD_KEPT = 20_000  # samples of one stream that may wait for what is missing before them
 CAUSES_NAMED = 100  # per stream: a hostile writer must not fill the memory
 
 
@@ -25,7 +28,11 @@ class Arrivals:
     expected: int = 0  # seq of the next sample
     last_stamp: int = BEGIN  # ns
     unreadable: int = 0  # refused samples whose seq is not known: they are not lost as well
-    left_out: list[LeftOut] = field(default_factory=list)  # to be told by a live host, which empties it
+    left_out: deque[LeftOut] = field(default_factory=lambda: deque(maxlen=NOTES_KEPT))  # a live host tells them
+    patient: bool = False  # what is missing can be had again: later samples wait for it
+    ahead: dict[int, Sample] = field(default_factory=dict)  # those that wait, by seq
+    handled_seq: int = -1  # of the last sample that needs no asking for
+    handled_stamp: int = BEGIN  # ns, likewise
     mark: PortMark | None = None  # of the writer, waiting for its last sample to arrive
     _named: set[str] = field(default_factory=set)
 
@@ -40,34 +47,67 @@ class Arrivals:
         self.unreadable += 1
         self.refuse(error)
 
-    def admit(self, message: Sample) -> bool:
-        """Whether `message` is the stream's next; counts it, and what is missing before it."""
-        if message.stamp <= self.last_stamp:
-            if message.seq < self.expected:
-                self.counts.repeated += 1
-                self._say_once("repeated", f"seq {message.seq} came again; dropped")
-            else:
-                stamps = f"seq {message.seq} has stamp {message.stamp}, after {self.last_stamp}"
-                self.refuse(f"time goes backwards: {stamps}", "backwards")
-                self.expected = message.seq + 1
-            return False
+    def admit(self, message: Sample, *, again: bool = False) -> list[Sample]:
+        """The samples that are next in the stream now that `message` has come; counts it, and what is missing.
+
+        `again`: it was asked for, so it is no fault if it has come before.
+        """
+        self.counts.received += 1
+        if message.stamp <= self.last_stamp or message.seq in self.ahead:
+            self._refuse_old(message, again=again)
+            return []
+        if self.patient and message.seq > self.expected + self.unreadable and len(self.ahead) < AHEAD_KEPT:
+            self.ahead[message.seq] = message
+            return []
         self._note_lost(message.seq)
-        self.unreadable = 0
+        return [self._next(message), *self._caught_up()]
+
+    def skip_to(self, seq: int) -> list[Sample]:
+        """Take what is missing before `seq` as lost; the samples that waited for it."""
+        self._note_lost(seq)
+        self.expected, self.unreadable = max(self.expected, seq), 0
+        return self._caught_up()
+
+    @property
+    def missing_before(self) -> int | None:
+        """The seq before which samples are known to be missing."""
+        if self.ahead:
+            return min(self.ahead)
+        return None if self.mark is None else self.mark.last_seq + 1
+
+    def _refuse_old(self, message: Sample, *, again: bool) -> None:
+        if again:
+            self.counts.received -= 1
+        elif message.seq < self.expected or message.seq in self.ahead:
+            self.counts.repeated += 1
+            self._say_once("repeated", f"seq {message.seq} came again; dropped")
+        else:
+            stamps = f"seq {message.seq} has stamp {message.stamp}, after {self.last_stamp}"
+            self.refuse(f"time goes backwards: {stamps}", "backwards")
+            self.expected = message.seq + 1
+
+    def _next(self, message: Sample) -> Sample:
         # A smaller seq with a newer stamp is a writer that was restarted and counts anew.
-        self.expected = message.seq + 1
+        self.expected, self.unreadable = message.seq + 1, 0
         self.last_stamp = message.stamp
-        return True
+        return message
+
+    def _caught_up(self) -> list[Sample]:
+        """The samples that waited and are next now."""
+        found = []
+        while (message := self.ahead.pop(self.expected, None)) is not None:
+            found.append(self._next(message))
+        return found
+
+    def note_handled(self, message: Sample) -> None:
+        """Note that `message` needs no asking for any more."""
+        if message.seq > self.handled_seq:
+            self.handled_seq, self.handled_stamp = message.seq, message.stamp
 
     def too_old(self, message: Sample, now: int) -> bool:
         """Whether `message` is older than the graph wants it."""
         limit = self.plan.max_age_ms
         return limit is not None and now - message.stamp > limit * 1e6
-
-    def give_up(self) -> None:
-        """Take what the writer's mark still promises as lost, so that it counts."""
-        if self.mark is not None:
-            self._note_lost(self.mark.last_seq + 1)
-            self.expected, self.unreadable = self.mark.last_seq + 1, 0
 
     def leave_out(self, message: Sample, reason: str) -> None:
         """Note a sample that came and is not handled."""

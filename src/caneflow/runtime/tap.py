@@ -19,15 +19,16 @@ class Tap:
         self.finished = False
         self._sink = sink
         self._watermarks = {port: BEGIN for port in inputs}
+        self._payloads: dict[str, dict[int, bytes]] = {port: {} for port in inputs}  # of samples on their way, by seq
 
-    def offer(self, port: str, message: Sample, payload: bytes, time: int) -> None:
-        """Take a decoded sample that arrived on `port` at `time` (ns)."""
+    def offer(self, port: str, message: Sample, payload: bytes, time: int, *, again: bool = False) -> None:
+        """Take a decoded sample that arrived on `port` at `time` (ns); `again`: it was asked for."""
         arrivals = self.inputs[port]
-        arrivals.counts.received += 1
-        if arrivals.admit(message):
-            arrivals.counts.handled += 1
-            self._sink.take(arrivals.plan.key, message, payload, time)
-            self._advance(port, message.stamp)
+        self._payloads[port][message.seq] = payload
+        for each in arrivals.admit(message, again=again):
+            self._take(port, each, time)
+        if message.seq not in arrivals.ahead:
+            self._payloads[port].pop(message.seq, None)
         self._count_mark(port)
 
     def refuse(self, port: str, error: MessageError) -> None:
@@ -40,9 +41,10 @@ class Tap:
         self.inputs[port].mark = mark
         self._count_mark(port)
 
-    def give_up(self, port: str) -> None:
-        """Stop waiting for samples of `port` that were sent and did not arrive."""
-        self.inputs[port].give_up()
+    def skip_to(self, port: str, seq: int, time: int) -> None:
+        """Stop waiting for samples of `port` before `seq` that were sent and did not arrive."""
+        for each in self.inputs[port].skip_to(seq):
+            self._take(port, each, time)
         self._count_mark(port)
 
     def close(self, port: str) -> None:
@@ -73,11 +75,19 @@ class Tap:
     def progress(self) -> Progress:
         """How far every stream has been taken."""
         taken = min(self._watermarks.values())
-        return Progress(self.node, END if self.finished else min(taken, END - 1), {})
+        confirmed = {each.plan.key: each.handled_seq for each in self.inputs.values()}
+        return Progress(self.node, END if self.finished else min(taken, END - 1), {}, confirmed)
 
     def input_counts(self) -> dict[str, InputCounts]:
         """What became of every sample that came, per port."""
         return {port: arrivals.counts for port, arrivals in self.inputs.items()}
+
+    def _take(self, port: str, message: Sample, time: int) -> None:
+        arrivals = self.inputs[port]
+        arrivals.counts.handled += 1
+        arrivals.note_handled(message)
+        self._sink.take(arrivals.plan.key, message, self._payloads[port].pop(message.seq), time)
+        self._advance(port, message.stamp)
 
     def _count_mark(self, port: str) -> None:
         watermark = self.inputs[port].arrived_mark()

@@ -1,0 +1,174 @@
+"""Where a person is in a room, from static Doppler modules and, if they wear one, an IMU.
+
+in   <sensor> : DopplerTarget   any number; the port's name is the sensor's in the rig
+in   imu      : Imu             its orientation tells which way the person faces; may be left out
+out  pose     : Pose            one per 50 ms, at the first sample of any input that is due
+
+`method` of a pose says more than the estimator's name: ` static_or_lost` when no sensor sees anything move, so that
+the position is held, and ` without west` when the sensor `west` has fallen silent.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, TypeAlias
+
+import numpy as np
+from annotated_types import Gt
+
+from caneflow.algorithms.dead_reckoning import heading_of
+from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
+from caneflow.algorithms.room_tracking import Echo, RoomTracker, StaticSensor, Vector2
+from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw
+from caneflow.messages import DopplerTarget, Imu, MessageError, Pose, Sample
+from caneflow.messages.rig import Rig
+from caneflow.runtime import ANY_PORT, Context, Emitted, Operator, Refused
+from caneflow.runtime.node import run
+
+Method: TypeAlias = Literal["ekf", "best"]
+
+IMU = "imu"
+SLOWEST_TO_FACE = 0.2  # m/s; without an IMU a slower velocity does not tell which way the person faces
+FLOOR_VARIANCE = 1e-6  # m^2 and m^2/s^2, of the height: the person is on the floor
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomTrackerSettings:
+    """Which method, what each may be told, and how the IMU is worn."""
+
+    __pydantic_config__ = {"extra": "forbid"}
+
+    method: Method = "best"
+    period: Annotated[float, Gt(0)] = 0.05  # s between poses
+    forward: tuple[float, float, float] = (1.0, 0.0, 0.0)  # the way the person faces, in the IMU's axes
+    silent_after: Annotated[float, Gt(0)] = 0.5  # s without a sample, after which a sensor counts as silent
+    ekf: RoomEkfSettings = field(default_factory=RoomEkfSettings)
+
+
+class RoomTrackerOperator(Operator):
+    """One tracker, told of every target and every heading, and asked once per period."""
+
+    inputs = {ANY_PORT: DopplerTarget, IMU: Imu}
+    outputs = {"pose": Pose}
+    optional_inputs = frozenset({IMU})
+    Settings = RoomTrackerSettings
+
+    def __init__(self, settings: RoomTrackerSettings, context: Context) -> None:
+        names = [port for port in context.ports if port != IMU]
+        self._settings = settings
+        self._tracker = tracker(settings, context, names)
+        self._heard_ns: dict[str, int | None] = dict.fromkeys(names)
+        self._begin_ns: int | None = None  # stamp of the first sample
+        self._due_ns = 0
+        self._facing: Quaternion | None = None  # by the IMU
+        self._course = 0.0  # rad, by the velocity
+
+    def handle(self, port: str, message: Sample) -> Emitted:
+        """Take the sample; yield a pose when one is due."""
+        discarded = self._tracker.discarded
+        match message:
+            case DopplerTarget():
+                self._take_target(port, message)
+            case Imu():
+                self._take_heading(message)
+        if message.stamp >= self._due_ns:
+            self._due_ns = message.stamp + round(self._settings.period * 1e9)
+            yield "pose", self._pose(message.stamp)
+        if self._tracker.discarded > discarded:  # so that it is counted and shown
+            raise Refused("a measurement that does not fit to where the person can be is left out")
+
+    def _take_target(self, sensor: str, target: DopplerTarget) -> None:
+        self._hear(target.stamp)
+        self._heard_ns[sensor] = target.stamp
+        self._tracker.echo(sensor, echo_of(target))
+
+    def _take_heading(self, imu: Imu) -> None:
+        self._hear(imu.stamp)
+        if imu.orientation is None:
+            raise Refused("the IMU sample has no orientation; put operators.attitude in front of room_tracker")
+        self._facing = imu.orientation
+        cosine, sine = heading_of(imu.orientation, self._settings.forward)
+        self._tracker.heading(imu.stamp, math.atan2(sine, cosine))
+
+    def _hear(self, stamp: int) -> None:
+        if self._begin_ns is None:
+            self._begin_ns = stamp
+
+    def _pose(self, stamp: int) -> Pose:
+        estimate = self._tracker.estimate(stamp)
+        (x, y), (u, v) = estimate.position, estimate.velocity
+        if math.hypot(u, v) > SLOWEST_TO_FACE:
+            self._course = math.atan2(v, u)
+        covariance = np.diag([FLOOR_VARIANCE] * 6)
+        plane = np.ix_((0, 1, 3, 4), (0, 1, 3, 4))
+        covariance[plane] = estimate.covariance
+        return Pose(
+            stamp=stamp,
+            position=(x, y, 0.0),
+            velocity=(u, v, 0.0),
+            orientation=self._facing or from_yaw(self._course),
+            covariance=covariance,
+            method=self._described(stamp),
+        )
+
+    def _described(self, stamp: int) -> str:
+        """The method, and what the pose has to do without."""
+        silent = [sensor for sensor in self._heard_ns if self._is_silent(sensor, stamp)]
+        parts = [self._settings.method]
+        if not self._tracker.moving:
+            parts.append("static_or_lost")
+        if silent:
+            parts.append(f"without {','.join(silent)}")
+        return " ".join(parts)
+
+    def _is_silent(self, sensor: str, stamp: int) -> bool:
+        assert self._begin_ns is not None
+        heard = self._heard_ns[sensor]
+        return stamp - (self._begin_ns if heard is None else heard) > self._settings.silent_after * 1e9
+
+
+def tracker(settings: RoomTrackerSettings, context: Context, names: list[str]) -> RoomTracker:
+    """The tracker that `method` names, with the sensors `names` of the rig; raises MessageError for a stranger."""
+    sensors = sensors_of(context.rig, names)
+    start, error = start_of(context.rig)
+    return RoomEkf(settings.ekf, sensors, start, error)
+
+
+def sensors_of(rig: Rig, names: list[str]) -> Mapping[str, StaticSensor]:
+    """The rig's sensors `names`; raises MessageError when there are none, or for one that the rig lacks."""
+    if not names:
+        raise MessageError("room_tracker: no sensor is wired; each is an input named as in rig.sensors")
+    strangers = [name for name in names if name not in rig.sensors]
+    if strangers:
+        there = ", ".join(rig.sensors) or "none"
+        raise MessageError(f"rig.sensors has no {', '.join(strangers)}; there are: {there}")
+    return {
+        name: StaticSensor(
+            position=rig.sensors[name].position[:2], azimuth=rig.sensors[name].azimuth, k=rig.sensors[name].k
+        )
+        for name in names
+    }
+
+
+def start_of(rig: Rig) -> tuple[Vector2, Vector2]:
+    """The guess of the start and its sd, m; without one the middle of the area, and all of it."""
+    if rig.start is not None:
+        return rig.start.position, (rig.start.sd, rig.start.sd)
+    west, east, south, north = rig.need("area")
+    return (0.5 * (west + east), 0.5 * (south + north)), ((east - west) / 12**0.5, (north - south) / 12**0.5)
+
+
+def echo_of(target: DopplerTarget) -> Echo:
+    """A target at the time that its value belongs to."""
+    strength = 20.0 * math.log10(target.amplitude) if target.amplitude > 0.0 else None
+    return Echo(
+        stamp_ns=target.stamp - round((target.delay or 0.0) * 1e9),
+        valid=target.valid,
+        range_rate=target.range_rate,
+        signed=target.signed,
+        strength=strength,
+    )
+
+
+if __name__ == "__main__":
+    run(RoomTrackerOperator)

@@ -1,0 +1,269 @@
+"""An extended Kalman filter of a person in a room: position, velocity, and what is slowly wrong with the sensors.
+
+State, in this order, n = 6 + number of sensors:
+
+    x, y    m, R0
+    u, v    m/s, velocity in R0
+    beta    rad, heading of travel less the IMU's yaw: the trunk is not quite along the way, north is not quite north
+    gamma   dB per dB, how much slower than R^-4 the strength falls
+    b_i     dB, what sensor i receives more than its k says: aspect, reflections, an imperfect calibration
+
+Between echoes the velocity turns with the IMU's yaw, so that an abrupt turn costs nothing; across the heading it is
+measured to be 0. Without an IMU it is a random walk.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+from numpy.typing import NDArray
+
+from caneflow.algorithms.room_tracking import (
+    DECIBEL,
+    LEAST_DISTANCE,
+    Area,
+    Echo,
+    HeadingHistory,
+    RoomEstimate,
+    SilenceWatch,
+    StaticSensor,
+    Vector2,
+    pattern_loss,
+)
+
+Array = NDArray[np.float64]
+X, Y, U, V, BETA, GAMMA, BIASES = 0, 1, 2, 3, 4, 5, 6  # places in the state
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomEkfSettings:
+    """Noise of the model and of the measurements; docs/methods/room.md says where each number comes from."""
+
+    use_speed: bool = True
+    use_strength: bool = True
+    use_heading: bool = True
+    walk_noise: Annotated[float, Gt(0)] = 1.1  # m/s/sqrt(s), without an IMU, on each axis
+    along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), with an IMU, along the heading
+    across_noise: Annotated[float, Gt(0)] = 0.3  # m/s/sqrt(s), with an IMU, across it
+    across_speed: Annotated[float, Gt(0)] = 0.1  # m/s, sd of the speed across the heading
+    yaw_error: Annotated[float, Ge(0)] = math.radians(7.0)  # rad, sd of beta
+    yaw_time: Annotated[float, Gt(0)] = 20.0  # s, correlation of beta
+    speed_error: Annotated[float, Gt(0)] = 0.12  # m/s
+    speed_share: Annotated[float, Gt(0), Le(1)] = 0.35  # of an echo that is new: windows overlap
+    strength_error: Annotated[float, Gt(0)] = 4.0  # dB, fast fading
+    strength_share: Annotated[float, Gt(0), Le(1)] = 0.3
+    bias_error: Annotated[float, Ge(0)] = 1.5  # dB, sd of b
+    bias_time: Annotated[float, Gt(0)] = 5.0  # s, correlation of b
+    gamma: float = 0.0  # expected
+    gamma_error: Annotated[float, Ge(0)] = 0.0
+    reference_range: Annotated[float, Gt(0)] = 6.0  # m, where k is right whatever gamma
+    range_error: Annotated[float, Gt(0)] = 0.1  # m, of sensors that measure it
+    degrees: Annotated[float, Gt(2)] = 4.0  # of freedom of the Student-t that all errors are taken to have
+    gate: Annotated[float, Gt(1)] = 5.0  # sd beyond which a measurement is discarded
+    hold_after: Annotated[float, Gt(0)] = 0.4  # s without a valid echo, after which the position is held
+    hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
+    hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
+    start_speed: Annotated[float, Gt(0)] = 0.7  # m/s, sd of each component before anything is known
+    heading_timeout: Annotated[float, Gt(0)] = 0.5  # s, after which the IMU counts as silent
+
+
+class RoomEkf:
+    """Takes headings and echoes as they come; stands at the time of the last echo."""
+
+    def __init__(
+        self,
+        settings: RoomEkfSettings,
+        sensors: Mapping[str, StaticSensor],
+        start: Vector2,
+        start_error: Vector2,
+    ) -> None:
+        self._settings = settings
+        self._sensors = dict(sensors)
+        self._place = {name: BIASES + index for index, name in enumerate(self._sensors)}
+        self._headings = HeadingHistory()
+        self._silence = SilenceWatch(settings.hold_after)
+        self._now_ns: int | None = None
+        self._crossed_ns: int | None = None  # when the heading was last used
+        self.discarded = 0
+        size = BIASES + len(self._sensors)
+        self._state = np.zeros(size)
+        self._state[:2] = start
+        self._state[GAMMA] = settings.gamma
+        spread = np.full(size, settings.bias_error)
+        spread[:BIASES] = (*start_error, settings.start_speed, settings.start_speed, settings.yaw_error,
+                           settings.gamma_error)
+        self._covariance = np.diag(spread**2)
+
+    @property
+    def moving(self) -> bool:
+        return self._now_ns is None or self._silence.moving(self._now_ns)
+
+    def heading(self, stamp_ns: int, yaw: float) -> None:
+        if self._settings.use_heading:
+            self._headings.add(stamp_ns, yaw)
+
+    def echo(self, sensor: str, echo: Echo) -> None:
+        self._silence.update(echo.stamp_ns, echo.valid)
+        self._advance(echo.stamp_ns)
+        if not echo.valid:
+            return
+        if echo.range is not None:
+            self._take_range(self._sensors[sensor], echo.range)
+        if self._settings.use_strength and echo.strength is not None:
+            self._take_strength(sensor, echo.strength)
+        if self._settings.use_speed:
+            self._take_speed(self._sensors[sensor], echo)
+
+    def estimate(self, stamp_ns: int) -> RoomEstimate:
+        state, covariance = self._state, self._covariance
+        if self._now_ns is not None and stamp_ns > self._now_ns:
+            state, covariance = self._predicted(stamp_ns, self.moving)
+        return RoomEstimate((float(state[X]), float(state[Y])), (float(state[U]), float(state[V])), covariance[:4, :4].copy())
+
+    # -- time --
+
+    def _advance(self, stamp_ns: int) -> None:
+        if self._now_ns is None:
+            self._now_ns = stamp_ns
+            return
+        if stamp_ns <= self._now_ns:
+            return
+        moving = self._silence.moving(stamp_ns)
+        self._state, self._covariance = self._predicted(stamp_ns, moving)
+        self._now_ns = stamp_ns
+        if moving and self._heading_known(stamp_ns):
+            self._take_heading(stamp_ns)
+
+    def _heading_known(self, stamp_ns: int) -> bool:
+        return self._headings.age(stamp_ns) < self._settings.heading_timeout
+
+    def _predicted(self, stamp_ns: int, moving: bool) -> tuple[Array, Array]:
+        assert self._now_ns is not None
+        s = self._settings
+        dt = (stamp_ns - self._now_ns) * 1e-9
+        size = len(self._state)
+        f = np.eye(size)
+        q = np.zeros(size)
+        cross = 0.0
+        if not moving:
+            decay = math.exp(-dt / s.hold_decay)
+            f[U, U] = f[V, V] = decay
+            q[X] = q[Y] = s.hold_noise**2 * dt
+            q[U] = q[V] = (1.0 - decay**2) * 0.3**2
+        elif self._heading_known(stamp_ns):
+            travel = self._headings.travel(self._now_ns, stamp_ns)
+            start = travel.yaw - travel.turned
+            c, n = math.cos(start), math.sin(start)
+            along, aside = c * travel.east + n * travel.north, c * travel.north - n * travel.east
+            f[X, U], f[X, V], f[Y, U], f[Y, V] = along, -aside, aside, along
+            c, n = math.cos(travel.turned), math.sin(travel.turned)
+            f[U, U], f[U, V], f[V, U], f[V, V] = c, -n, n, c
+            yaw = travel.yaw + float(self._state[BETA])
+            c, n = math.cos(yaw), math.sin(yaw)
+            a, b = s.along_noise**2 * dt, s.across_noise**2 * dt
+            q[U], q[V], cross = a * c * c + b * n * n, a * n * n + b * c * c, (a - b) * c * n
+        else:
+            f[X, U] = f[Y, V] = dt
+            q[U] = q[V] = s.walk_noise**2 * dt
+        q[X] += q[U] * dt * dt / 3.0
+        q[Y] += q[V] * dt * dt / 3.0
+        f[BETA, BETA] = math.exp(-dt / s.yaw_time)
+        q[BETA] = (1.0 - f[BETA, BETA] ** 2) * s.yaw_error**2
+        keep = math.exp(-dt / s.bias_time)
+        for place in self._place.values():
+            f[place, place] = keep
+            q[place] = (1.0 - keep**2) * s.bias_error**2
+        covariance = f @ self._covariance @ f.T
+        covariance[np.arange(size), np.arange(size)] += q
+        covariance[U, V] += cross
+        covariance[V, U] += cross
+        return f @ self._state, covariance
+
+    # -- measurements --
+
+    def _take_heading(self, stamp_ns: int) -> None:
+        """The velocity is along the heading: what it has across is 0."""
+        dt = 0.05 if self._crossed_ns is None else (stamp_ns - self._crossed_ns) * 1e-9
+        self._crossed_ns = stamp_ns
+        yaw = self._headings.travel(stamp_ns, stamp_ns).yaw + float(self._state[BETA])
+        c, n = math.cos(yaw), math.sin(yaw)
+        u, v = float(self._state[U]), float(self._state[V])
+        h = np.zeros(len(self._state))
+        h[U], h[V], h[BETA] = -n, c, -(c * u + n * v)
+        # one measurement of this error per 0.25 s, however often it is made
+        self._correct(h, n * u - c * v, self._settings.across_speed**2 * 0.25 / max(dt, 1e-3))
+
+    def _sight(self, sensor: StaticSensor) -> tuple[float, float, float]:
+        """Distance to the person, and the direction to them."""
+        dx, dy = float(self._state[X]) - sensor.position[0], float(self._state[Y]) - sensor.position[1]
+        distance = max(math.hypot(dx, dy), LEAST_DISTANCE)
+        return distance, dx / distance, dy / distance
+
+    def _take_range(self, sensor: StaticSensor, measured: float) -> None:
+        distance, ex, ey = self._sight(sensor)
+        h = np.zeros(len(self._state))
+        h[X], h[Y] = ex, ey
+        self._correct_robustly(h, measured - distance, self._settings.range_error**2)
+
+    def _take_strength(self, name: str, measured: float) -> None:
+        s = self._settings
+        sensor = self._sensors[name]
+        if sensor.k is None:
+            return
+        distance, ex, ey = self._sight(sensor)
+        off = math.remainder(math.atan2(ey, ex) - sensor.azimuth, math.tau)
+        gamma = float(self._state[GAMMA])
+        ratio = DECIBEL * math.log(distance / s.reference_range)
+        expected = (
+            DECIBEL * math.log(sensor.k) - 4.0 * DECIBEL * math.log(distance) - pattern_loss(off)
+            + gamma * ratio + float(self._state[self._place[name]])
+        )
+        slope = (gamma - 4.0) * DECIBEL / distance
+        turn = -2.0 * DECIBEL * math.tan(min(max(off, -1.3), 1.3)) / distance
+        h = np.zeros(len(self._state))
+        h[X], h[Y] = slope * ex - turn * ey, slope * ey + turn * ex
+        h[GAMMA] = ratio
+        h[self._place[name]] = 1.0
+        self._correct_robustly(h, measured - expected, s.strength_error**2 / s.strength_share)
+
+    def _take_speed(self, sensor: StaticSensor, echo: Echo) -> None:
+        s = self._settings
+        distance, ex, ey = self._sight(sensor)
+        u, v = float(self._state[U]), float(self._state[V])
+        expected = u * ex + v * ey
+        h = np.zeros(len(self._state))
+        h[U], h[V] = ex, ey
+        h[X], h[Y] = (u - expected * ex) / distance, (v - expected * ey) / distance
+        noise = s.speed_error**2 / s.speed_share
+        if echo.signed:
+            self._correct_robustly(h, echo.range_rate - expected, noise)
+            return
+        variance = float(h @ self._covariance @ h) + noise
+        away, towards = echo.range_rate - expected, -echo.range_rate - expected
+        # how much likelier one sign is than the other; both are taken as far as they are likely
+        odds = math.exp(min(max(0.5 * (away**2 - towards**2) / variance, -50.0), 50.0))
+        share = 1.0 / (1.0 + odds)  # of `away`
+        mean = share * away + (1.0 - share) * towards
+        self._correct_robustly(h, mean, noise, spread=share * (1.0 - share) * (away - towards) ** 2)
+
+    def _correct_robustly(self, h: Array, residual: float, noise: float, spread: float = 0.0) -> None:
+        """Student-t: the larger the residual, the less it is believed; none at all beyond the gate."""
+        variance = float(h @ self._covariance @ h) + noise
+        normalized = residual**2 / variance
+        if normalized > self._settings.gate**2:
+            self.discarded += 1
+            return
+        nu = self._settings.degrees
+        noise *= max((nu + normalized) / (nu + 1.0), 1.0)
+        self._correct(h, residual, noise, spread)
+
+    def _correct(self, h: Array, residual: float, noise: float, spread: float = 0.0) -> None:
+        ph = self._covariance @ h
+        variance = float(h @ ph) + noise
+        gain = ph / variance
+        self._state = self._state + gain * residual
+        # P - K S K' is symmetric by construction; `spread` is what the choice between two signs leaves open
+        self._covariance = self._covariance - np.outer(gain, gain) * (variance - spread)

@@ -1,0 +1,162 @@
+"""What the room's trackers share: their shape, the sensors they look through, the time that a value belongs to.
+
+A front end's value belongs to the middle of its window, not to its stamp (room.md row 9). So a tracker lives in the
+past: it stands at the time of the last value, and what it says of now is predicted from there.
+"""
+
+import math
+from bisect import bisect_right
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector2 = tuple[float, float]
+Area = tuple[float, float, float, float]  # xmin, xmax, ymin, ymax, m
+
+HALF_POWER_AZIMUTH = math.radians(60.0)  # one way, -3 dB: the paper's patch antennas
+# cos^2p of the azimuth, there and back; p = 1 for 60 degrees
+PATTERN_EXPONENT = 2.0 * math.log(0.5) / math.log(math.cos(HALF_POWER_AZIMUTH))
+LEAST_COSINE = 0.2  # the pattern's tail is not trusted: no more than 14 dB are taken off
+LEAST_DISTANCE = 0.3  # m; nobody stands in a sensor
+DECIBEL = 10.0 / math.log(10.0)  # dB per unit of a natural logarithm
+HISTORY = 256  # headings: 2.5 s at 100 Hz
+
+
+@dataclass(frozen=True, kw_only=True)
+class StaticSensor:
+    """One Doppler module on its wall."""
+
+    position: Vector2  # m, R0
+    azimuth: float  # rad, of its boresight
+    k: float | None = None  # m^4: squared amplitude = k / R^4; None: its strength says nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Echo:
+    """What one sensor saw of the person, at the time that it belongs to."""
+
+    stamp_ns: int  # the middle of the window
+    valid: bool
+    range_rate: float = 0.0  # m/s, positive away; the magnitude when not signed
+    signed: bool = True
+    strength: float | None = None  # dB, squared amplitude
+    range: float | None = None  # m, of a sensor that measures it
+
+
+class RoomEstimate(NamedTuple):
+    """Where the person is and how they move, R0."""
+
+    position: Vector2  # m
+    velocity: Vector2  # m/s
+    covariance: NDArray[np.float64]  # (4, 4) of position and velocity
+
+
+class RoomTracker(Protocol):
+    """The shape of every method: headings and echoes in, an estimate whenever one is asked for."""
+
+    @property
+    def moving(self) -> bool:
+        """Whether anything tells that the person moves: no, if all sensors are below their thresholds."""
+
+    @property
+    def discarded(self) -> int:
+        """How many measurements were inconsistent and left out."""
+
+    def heading(self, stamp_ns: int, yaw: float) -> None:
+        """Take the direction that the person faces, rad in R0; in the order of time."""
+
+    def echo(self, sensor: str, echo: Echo) -> None:
+        """Take what a sensor saw."""
+
+    def estimate(self, stamp_ns: int) -> RoomEstimate:
+        """The estimate at a time that is not before anything taken; changes nothing."""
+
+
+class Travel(NamedTuple):
+    """What a second's walk of 1 m/s along the heading would have come to between two times."""
+
+    east: float  # m per m/s
+    north: float  # m per m/s
+    turned: float  # rad, heading at the end less that at the start
+    yaw: float  # rad, heading at the end
+
+
+class HeadingHistory:
+    """The last headings, and the way that goes along them."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[int] = deque(maxlen=HISTORY)
+        self._yaws: deque[float] = deque(maxlen=HISTORY)  # rad, unwrapped
+        self._east: deque[float] = deque(maxlen=HISTORY)  # m per m/s, integral of the cosine
+        self._north: deque[float] = deque(maxlen=HISTORY)
+
+    def __bool__(self) -> bool:
+        return bool(self._stamps)
+
+    def add(self, stamp_ns: int, yaw: float) -> None:
+        """Append a heading; raises ValueError when time does not go on."""
+        if not self._stamps:
+            self._append(stamp_ns, yaw, 0.0, 0.0)
+            return
+        if stamp_ns <= self._stamps[-1]:
+            raise ValueError(f"heading at {stamp_ns} ns is not after the one before, {self._stamps[-1]} ns")
+        before = self._yaws[-1]
+        yaw = before + math.remainder(yaw - before, math.tau)
+        elapsed = (stamp_ns - self._stamps[-1]) * 1e-9
+        middle = 0.5 * (before + yaw)
+        self._append(
+            stamp_ns, yaw, self._east[-1] + elapsed * math.cos(middle), self._north[-1] + elapsed * math.sin(middle)
+        )
+
+    def travel(self, start_ns: int, end_ns: int) -> Travel:
+        """Between two times; before the first and after the last heading it holds."""
+        e0, n0, yaw0 = self._at(start_ns)
+        e1, n1, yaw1 = self._at(end_ns)
+        return Travel(e1 - e0, n1 - n0, yaw1 - yaw0, yaw1)
+
+    def age(self, stamp_ns: int) -> float:
+        """s since the last heading; infinite when there is none."""
+        return (stamp_ns - self._stamps[-1]) * 1e-9 if self._stamps else math.inf
+
+    def _append(self, stamp_ns: int, yaw: float, east: float, north: float) -> None:
+        self._stamps.append(stamp_ns)
+        self._yaws.append(yaw)
+        self._east.append(east)
+        self._north.append(north)
+
+    def _at(self, stamp_ns: int) -> tuple[float, float, float]:
+        after = bisect_right(self._stamps, stamp_ns)
+        at = max(after - 1, 0)
+        elapsed = (stamp_ns - self._stamps[at]) * 1e-9
+        yaw = self._yaws[at]
+        if 0 < after < len(self._stamps):
+            rate = (self._yaws[after] - yaw) / (self._stamps[after] - self._stamps[at]) * 1e9
+            middle, yaw = yaw + 0.5 * rate * elapsed, yaw + rate * elapsed
+        else:
+            middle = yaw
+        return self._east[at] + elapsed * math.cos(middle), self._north[at] + elapsed * math.sin(middle), yaw
+
+
+class SilenceWatch:
+    """Which sensors are there, and whether any of them sees something move (room.md row 11)."""
+
+    def __init__(self, hold: float) -> None:
+        self._hold_ns = round(hold * 1e9)
+        self._seen_ns: int | None = None  # when any sensor last saw something move
+
+    def update(self, stamp_ns: int, valid: bool) -> None:
+        """Take whether a sensor sees something move."""
+        if valid or self._seen_ns is None:
+            self._seen_ns = stamp_ns
+
+    def moving(self, stamp_ns: int) -> bool:
+        """Whether some sensor has seen something move not long before; true before the first echo."""
+        return self._seen_ns is None or stamp_ns - self._seen_ns <= self._hold_ns
+
+
+def pattern_loss(azimuth_off: float) -> float:
+    """What the antenna takes off an echo, dB, at an angle (rad) off its boresight; 6 dB at 60 degrees."""
+    return -10.0 * PATTERN_EXPONENT * math.log10(max(math.cos(azimuth_off), LEAST_COSINE))

@@ -1,0 +1,229 @@
+"""`best` on made-up walks: conventions, delays, rest, gaps, loss of inputs, and whether its covariance is honest."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
+from caneflow.algorithms.dead_reckoning import PoseEstimate
+from caneflow.algorithms.rotations import (
+    Quaternion,
+    Vector,
+    conjugate,
+    from_rotation_vector,
+    from_yaw,
+    multiply,
+    rotate,
+)
+
+Floats = NDArray[np.float64]
+START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 10_000_000
+BORESIGHT: Vector = (0.0, 1.0, 0.0)
+PIVOT: Vector = (0.0, -0.3, 0.0)
+PITCH = math.radians(42)
+GRAVITY = 9.80665
+UNOBSERVED = 1e6
+DEGREE = math.pi / 180.0
+
+
+def held(yaw: float) -> Quaternion:
+    """The cane pitched by 42 deg, its boresight at `yaw`."""
+    return multiply(from_yaw(yaw - math.pi / 2), from_rotation_vector((-PITCH, 0.0, 0.0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walk:
+    """A walk at 100 Hz: yaws (rad) of boresight and velocity, speeds (m/s) along it; the gyro's bias (rad/s)."""
+
+    yaws: Floats
+    headings: Floats  # rad, of the way
+    speeds: Floats  # m/s along the way
+    gyro_bias: float = 0.0  # about the vertical
+    north: Floats | None = None  # rad, by which the field errs
+    noise: float = 0.0  # m/s, sd of the radar
+    seed: int = 0
+    truth: Floats = field(init=False)  # (n, 2) m
+
+    def __post_init__(self) -> None:
+        moved = self.speeds[:, None] * np.stack([np.cos(self.headings), np.sin(self.headings)], axis=1) * 0.01
+        object.__setattr__(self, "truth", np.cumsum(moved, axis=0) - moved[0])
+
+
+def run(
+    walk: Walk,
+    *,
+    settings: CaneFilterSettings | None = None,
+    delay: int = 0,
+    speeds_only: bool = False,
+    mag: bool = True,
+    speed_first: bool = False,
+    dropped: slice = slice(0, 0),
+) -> tuple[CaneFilter, list[PoseEstimate]]:
+    """The filter's estimates; radar values belong `delay` samples before their stamps; samples `dropped` are lost."""
+    cane = CaneFilter(settings or CaneFilterSettings(), boresight=BORESIGHT, pivot=PIVOT)
+    rng = np.random.default_rng(walk.seed)
+    velocity = walk.speeds[:, None] * np.stack([np.cos(walk.headings), np.sin(walk.headings)], axis=1)
+    force = np.gradient(velocity, 0.01, axis=0)
+    rates = np.gradient(np.unwrap(walk.yaws), 0.01)
+    lost = set(range(len(walk.yaws))[dropped])
+    estimates = []
+    for index, yaw in enumerate(walk.yaws.tolist()):
+        if index in lost:
+            continue
+        stamp_ns = START_NS + index * PERIOD_NS
+        back = max(index - delay, 0)
+        seen = velocity[back] @ (math.cos(walk.yaws[back]), math.sin(walk.yaws[back])) + walk.noise * rng.normal()
+
+        def radar(stamp_ns: int = stamp_ns, seen: float = float(seen)) -> None:
+            if speeds_only:
+                cane.speed(stamp_ns, seen, 0.05, True, 0.01 * delay)
+            else:
+                variance = max(walk.noise, 0.03) ** 2
+                cane.velocity(stamp_ns, (seen, 0.0), (variance, 0.0, UNOBSERVED), 0.01 * delay)
+
+        body = held(yaw)
+        inverse = conjugate(body)
+        gyro = rotate(inverse, (0.0, 0.0, float(rates[index]) + walk.gyro_bias))
+        accel = rotate(inverse, (float(force[index, 0]), float(force[index, 1]), GRAVITY))
+        north = 0.0 if walk.north is None else float(walk.north[index])
+        if speed_first:
+            radar()
+        if mag:
+            cane.magnetic_field(rotate(inverse, (-20.0 * math.sin(north), 20.0 * math.cos(north), -40.0)))
+        estimates.append(cane.imu(stamp_ns, gyro, accel, body, None))
+        if not speed_first:
+            radar()
+    return cane, estimates
+
+
+def loop(*, swing: float = 20 * DEGREE, **more: float | int | Floats) -> Walk:
+    """Once round 8 x 3 m at 0.45 m/s, 2 s of rest at both ends, swinging at 0.55 Hz."""
+    headings, speeds = [np.zeros(200)], [np.zeros(200)]
+    for side, length in enumerate((8.0, 3.0, 8.0, 3.0)):
+        count = round(length / 0.0045)
+        headings.append(np.full(count, side * math.pi / 2))
+        speeds.append(np.full(count, 0.45))
+        if side < 3:
+            headings.append((side + np.linspace(0.0, 1.0, 150)) * math.pi / 2)
+            speeds.append(np.full(150, 1e-3))
+    headings.append(np.full(200, 1.5 * math.pi))
+    speeds.append(np.zeros(200))
+    way = np.concatenate(headings)
+    speed = np.convolve(np.concatenate(speeds), np.hanning(61) / np.hanning(61).sum(), mode="same")
+    swinging = swing * np.sin(2 * math.pi * 0.55 * 0.01 * np.arange(len(way))) * np.minimum(speed / 0.45, 1.0)
+    return Walk(yaws=way + swinging, headings=way, speeds=speed, **more)  # type: ignore[arg-type]
+
+
+def final_error(walk: Walk, estimates: list[PoseEstimate]) -> float:
+    x, y, _ = estimates[-1].position
+    return math.hypot(x - walk.truth[-1, 0], y - walk.truth[-1, 1])
+
+
+def test_an_open_path_along_y_goes_along_y() -> None:
+    """A quarter turn too much or too little would not show on a loop."""
+    way = np.full(1000, math.pi / 2)
+    walk = Walk(yaws=way, headings=way, speeds=np.full(1000, 0.5))
+    _, estimates = run(walk)
+    x, y, _ = estimates[-1].position
+    assert (x, y) == pytest.approx((0.0, 4.995), abs=0.06)
+    assert estimates[-1].velocity[:2] == pytest.approx((0.0, 0.5), abs=0.02)
+    assert estimates[-1].orientation == pytest.approx(held(math.pi / 2), abs=1e-6)
+
+
+@pytest.mark.parametrize("delay", [0, 3, 32])
+def test_a_swinging_loop_with_late_radar_comes_back(delay: int) -> None:
+    walk = loop()
+    _, estimates = run(walk, delay=delay)
+    assert final_error(walk, estimates) < 0.12
+    track = np.array([e.position[:2] for e in estimates])
+    assert np.abs(track - walk.truth).max() < 0.25
+
+
+def test_the_radar_sees_a_component_only_and_the_swing_shows_the_rest() -> None:
+    """The cane points 10 deg off the way all the time: taken for the heading, that would be 1.7 m in 10 m."""
+    time = 0.01 * np.arange(2400)
+    way = np.zeros(2400)
+    yaws = 10 * DEGREE + 20 * DEGREE * np.sin(2 * math.pi * 0.55 * time)
+    speeds = 0.45 * np.minimum(time / 1.0, 1.0)
+    _, estimates = run(Walk(yaws=yaws, headings=way, speeds=speeds))
+    assert abs(estimates[-1].position[1]) < 0.5
+
+
+def test_standing_the_position_stays() -> None:
+    still = np.zeros(3000)
+    _, estimates = run(Walk(yaws=still, headings=still, speeds=still, noise=0.05))
+    assert math.hypot(*estimates[-1].position[:2]) < 0.05
+    assert math.hypot(*estimates[-1].velocity[:2]) < 0.01
+
+
+def test_the_paper_speed_serves_where_nothing_better_comes() -> None:
+    walk = loop()
+    _, estimates = run(walk, speeds_only=True, delay=32)
+    assert final_error(walk, estimates) < 0.5
+    _, blind = run(walk, delay=3)
+    mixed, _ = run(walk, speeds_only=True)
+    assert mixed.gaps == 0
+    assert final_error(walk, blind) < final_error(walk, estimates) + 0.1
+
+
+def test_the_field_where_the_walk_began_shows_the_gyros_bias() -> None:
+    base = loop()
+    x, y = base.truth.T
+    north = 10 * DEGREE * (np.sin(x / 2.0 + 1.0) + np.cos(y / 2.0 - x / 3.0) - 1.2)
+    walk = loop(gyro_bias=0.15 * DEGREE, north=north)
+    cane, estimates = run(walk)
+    _, without = run(walk, mag=False)
+    assert cane.gyro_bias == pytest.approx(0.15 * DEGREE, abs=0.06 * DEGREE)
+    assert final_error(walk, estimates) < 0.5 * final_error(walk, without) + 0.05
+
+
+def test_a_heading_that_cannot_be_known_shows_in_the_covariance() -> None:
+    walk = loop(gyro_bias=0.3 * DEGREE)
+    _, with_field = run(walk)
+    north = np.cumsum(np.random.default_rng(1).normal(0.0, 0.02, len(walk.yaws)))  # wanders without a map
+    _, lost = run(loop(gyro_bias=0.3 * DEGREE, north=north), mag=True)
+    spread = [math.sqrt(np.trace(e[-1].covariance[:2, :2])) for e in (with_field, lost)]  # type: ignore[index]
+    assert spread[1] > 0.3
+    assert final_error(walk, lost) < 4.0 * spread[1]
+
+
+def test_the_covariance_is_a_covariance() -> None:
+    _, estimates = run(loop(noise=0.05))
+    for estimate in estimates[::50]:
+        assert estimate.covariance is not None
+        np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, atol=1e-12)
+        assert np.linalg.eigvalsh(estimate.covariance).min() > -1e-9
+    first, last = estimates[0].covariance, estimates[-1].covariance
+    assert first is not None
+    assert last is not None
+    assert np.trace(first[:2, :2]) < 1e-6 < np.trace(last[:2, :2])
+
+
+def test_a_gap_is_counted_and_bridged() -> None:
+    way = np.zeros(1500)
+    walk = Walk(yaws=way, headings=way, speeds=np.full(1500, 0.5))
+    cane, estimates = run(walk, dropped=slice(700, 900))
+    assert cane.gaps == 1
+    assert estimates[-1].position[0] == pytest.approx(7.5, abs=0.3)
+    before, after = estimates[699].covariance, estimates[700].covariance
+    assert before is not None
+    assert after is not None
+    assert after[0, 0] > 50 * before[0, 0]
+
+
+def test_the_order_of_delivery_of_one_stamp_does_not_matter() -> None:
+    walk = loop(noise=0.05)
+    _, after = run(walk)
+    _, before = run(walk, speed_first=True)
+    assert [e.position for e in after] == [e.position for e in before]
+
+
+def test_what_is_missing_is_named() -> None:
+    cane = CaneFilter(CaneFilterSettings(), boresight=BORESIGHT)
+    with pytest.raises(ValueError, match="best: the imu sample has no orientation"):
+        cane.imu(START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), None, None)
+    with pytest.raises(ValueError, match="neither linear_accel nor accel"):
+        cane.imu(START_NS, (0.0, 0.0, 0.0), None, held(0.0), None)
