@@ -46,6 +46,7 @@ BIN_PS = 2  # ps, the finest step of delay, rounded up: how far the radar may mo
 QUANTUM_PS = 5860  # ps, 96 bins of 61.035 ps, rounded up: how far the radar may move its end
 RAW = 1  # scan type: neither filtered nor detected
 LOSS_PERIOD = 10.0  # s between two lines about losses
+FIRST_LOSS_LINE = 2.0  # s after the start, when it is known how often the radar scans
 CLOCK_SET = 1_000_000  # ns by which the host's clock must differ from what it was to have been set
 TICKS_PER_SECOND = 1e3  # of the radar's clock
 
@@ -435,8 +436,9 @@ class P440(Source):
         self._incomplete_before += self._assembler.counts.incomplete_scans
         self._assembler = assembler = ScanAssembler(patience_ms=patience)
         self._framing.restart()
+        heard = self._clock.now()
+        self._next_loss_line = max(self._next_loss_line, heard + round(FIRST_LOSS_LINE * 1e9))
         try:
-            heard = self._clock.now()
             while True:
                 packet = radar.next_packet(settings.silence_s - (self._clock.now() - heard) / 1e9)
                 now = self._clock.now()

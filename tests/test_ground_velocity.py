@@ -50,7 +50,8 @@ def ground(forward: float, *, scans: int, noise: float = 0.0, height: float = HE
     phase = 4 * math.pi * PARAMETERS.carrier / SPEED_OF_LIGHT * closing * 0.01
     made = speckle * np.exp(1j * phase * np.arange(scans)[:, None])
     made += noise * (rng.normal(size=made.shape) + 1j * rng.normal(size=made.shape))
-    return made.astype(np.complex64)
+    scans_made: Scans = made.astype(np.complex64)
+    return scans_made
 
 
 def run(

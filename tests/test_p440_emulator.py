@@ -1,6 +1,5 @@
 """The emulated P440: the protocol it speaks, the faults it has, and what it makes of recorded packets."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -150,9 +149,9 @@ def test_faults_are_as_frequent_as_asked() -> None:
     assert counts.lost / 10_000 == pytest.approx(0.02, abs=0.005)
     keys = [(p.message_id, p.message_index) for p in packets]
     assert len(keys) - len(set(keys)) == pytest.approx(counts.duplicated, rel=0.1)
-    places = {key: place for place, key in enumerate(dict.fromkeys(keys))}
-    early = [place - list(sorted(places)).index(key) for key, place in list(places.items())[:500]]
-    assert 1 <= max(early) <= 4, "overtaken by a few, not by many"
+    arrived = list(dict.fromkeys(keys))
+    places = {key: place for place, key in enumerate(sorted(arrived))}
+    assert 1 <= max(place - places[key] for place, key in enumerate(arrived)) <= 6, "overtaken by a few, not by many"
 
 
 def test_it_freezes_once_until_it_is_started_anew() -> None:
@@ -209,8 +208,3 @@ def test_a_log_of_something_else_is_refused() -> None:
     _, played = moments_of_log(CONFIG.to_bytes() + mrm.build(START).ljust(1452, b"\0"))
     with pytest.raises(ProtocolError, match="byte 32: a ControlRequest"):
         list(played)
-
-
-def test_never_is_a_time() -> None:
-    assert math.isinf(Faults().freeze_at)
-    assert emulator(0).over

@@ -114,7 +114,8 @@ def _tool(module: str) -> Any:
     if hasattr(tool, "commands"):
         app.callback(help=tool.__doc__)(_no_options)
         for word, function in tool.commands.items():
-            app.command(word)(function)
+            # A second word may have a module of its own: programs do not import each other.
+            app.command(word)(import_module(f"{TOOLS}.{function}").command if isinstance(function, str) else function)
     else:
         app.command()(tool.command)
     return typer.main.get_command(app)

@@ -46,8 +46,9 @@ def predominant_line(spectrum: DopplerSpectrum, settings: DopplerLineSettings) -
     frequency = float(frequencies[peak]) + shift * float(frequencies[1] - frequencies[0])
     snr = max(10.0 / math.log(10.0) * (logarithm - math.log(float(floor[peak]))), LOWEST_SNR)
     near = np.abs(frequencies - frequency) <= settings.half_width
-    energy = float(np.maximum(excess, 0.0).sum())
-    share = float(np.maximum(excess[near], 0.0).sum()) / energy if energy > 0.0 else 0.0
+    # not clipped at 0: what noise has above its mean in one bin it lacks in another
+    inside, energy = float(excess[near].sum()), float(excess.sum())
+    share = inside / max(energy, inside) if inside > 0.0 else 0.0
     range_rate = -SPEED_OF_LIGHT * frequency / (2.0 * spectrum.carrier)
     return DopplerLine(
         range_rate=range_rate if spectrum.signed else abs(range_rate),

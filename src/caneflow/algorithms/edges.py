@@ -1,5 +1,7 @@
 """The superior edge of a Doppler spectrum: where it falls off towards higher speed (paper IV.B, cane.md row 6)."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,29 +10,36 @@ from numpy.typing import NDArray
 # pull the steepest fall of the expected spectrum back to 0.86..0.77 cell for fastest lines at 3..12 cells, seen
 # through a Gaussian beam of 50 deg. tests/test_edges.py works both out.
 EDGE_BEYOND_SPEED = 0.8  # resolution cells
-FLAT = np.float32(1e-30)
-AROUND = np.arange(3)[:, None]  # a column and its two neighbours
 
 
-def superior_edges(
-    magnitudes: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.floating]]:
+def superior_edges(magnitudes: NDArray[np.floating]) -> tuple[list[float], list[float]]:
     """Where each row falls off most steeply, and by how much.
 
     Args:
         magnitudes: shape (K, F), rows of magnitude over growing Doppler, F at least 4.
 
     Returns:
-        Fractional column indices, shape (K,): the vertex of the parabola through the greatest difference between
-        neighbours and the two beside it; and those differences, shape (K,). A flat row gives some index, and 0:
-        whether there is anything to see is not decided here.
+        K fractional column indices: the vertex of the parabola through the greatest difference between neighbours
+        and the two beside it; and K such differences. A flat row gives some index, and 0: whether there is anything
+        to see is not decided here.
     """
     falls = magnitudes[:, :-1] - magnitudes[:, 1:]
     steepest = falls[:, 1:-1].argmax(axis=1)  # counted from column 1: with a neighbour on either side
-    left = steepest + np.arange(0, falls.size, falls.shape[1])
-    before, top, after = falls.take(left + AROUND)
-    rise, drop = top - before, top - after
-    # FLAT keeps a flat row from dividing by 0; the clip holds where a neighbour at the rim falls still steeper.
-    shift = np.minimum(np.maximum((rise - drop) / np.maximum(rise + drop, FLAT), -1), 1)
+    before, top, after = falls.take(steepest + _around(*falls.shape)).tolist()
     # The difference between columns i and i + 1 belongs half way between them.
-    return steepest + (1.5 + 0.5 * shift), top
+    edges = [i + 1.5 + _vertex(b, t, a) for i, b, t, a in zip(steepest.tolist(), before, top, after, strict=True)]
+    return edges, top
+
+
+def _vertex(before: float, top: float, after: float) -> float:
+    """Where the parabola through three neighbours has its top, in columns from the middle one; 0 if they are equal."""
+    rise, drop = top - before, top - after
+    if rise < 0.0 or drop < 0.0:  # a neighbour at the rim falls still steeper
+        return -0.5 if rise < drop else 0.5
+    return 0.5 * (rise - drop) / (rise + drop) if rise + drop > 0.0 else 0.0
+
+
+@cache
+def _around(rows: int, columns: int) -> NDArray[np.intp]:
+    """What to add to a column index of each of K rows for it and its neighbours in the flat array; shape (3, K)."""
+    return np.arange(0, rows * columns, columns) + np.arange(3)[:, None]

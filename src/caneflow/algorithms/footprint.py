@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from caneflow.algorithms.range_doppler import range_of_bin
 from caneflow.algorithms.rotations import Quaternion, Vector, depression_of, rotate
 
 
@@ -43,13 +44,13 @@ class Fan:
 
 
 class Rays(NamedTuple):
-    """The rays that meet the ground inside the recorded ranges; shape (0,) twice if there are none."""
+    """The rays that meet the ground inside the recorded ranges; empty if there are none."""
 
     rows: NDArray[np.intp]  # shape (K + 2,), growing range bins: ray i is row i + 1, between its neighbours
-    cosines: NDArray[np.float64]  # shape (K,), cos of a ray's angle to the ground
+    cosines: list[float]  # K, cos of a ray's angle to the ground
 
 
-NO_RAYS = Rays(rows=np.empty(0, dtype=np.intp), cosines=np.empty(0))
+NO_RAYS = Rays(rows=np.empty(0, dtype=np.intp), cosines=[])
 
 
 class RayCaster:
@@ -65,8 +66,8 @@ class RayCaster:
         self._start, self._step = range_start, range_step
         self._nearest, self._farthest = range_start, range_start + (bins - 1) * range_step
         self._shares = np.linspace(0.0, 1.0, fan.rays + 2)
-        self._squares = (range_start + np.arange(bins) * range_step) ** 2  # m^2, range of each bin
-        self._steepest_square = math.sin(fan.steepest) ** 2
+        ranges = range_of_bin(np.arange(bins), start=range_start, step=range_step)
+        self._squares: list[float] = (ranges**2).tolist()  # m^2, of each bin
 
     def cast(self, *, height: float, axis: float) -> Rays:
         """The rays of an antenna at `height` m whose beam points `axis` rad (alpha0) below the horizontal.
@@ -84,5 +85,7 @@ class RayCaster:
         scaled = self._shares * ((last - first) / self._step) + ((first - self._start) / self._step + 0.5)
         rows = scaled.astype(np.intp)
         # A ray's angle is that of its bin's centre: rounding would cost up to 2 % of speed at steep angles.
-        squares = np.minimum(height * height / self._squares[rows[1:-1]], self._steepest_square)  # of the sines
-        return Rays(rows=rows, cosines=np.sqrt(1.0 - squares))
+        # Plain Python: for a handful of numbers, numpy's calls cost more.
+        square, steepest = height * height, math.sin(fan.steepest) ** 2
+        sines = [min(square / self._squares[row], steepest) for row in rows[1:-1].tolist()]  # squared
+        return Rays(rows=rows, cosines=[math.sqrt(1.0 - sine) for sine in sines])

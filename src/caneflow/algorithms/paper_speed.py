@@ -118,7 +118,7 @@ class PaperSpeed:
             carrier=returns.parameters.carrier,
             transform=settings.transform,
         )
-        speeds, falls = self._ray_speeds(power, floor / settings.rays, per_bin / rays.cosines)
+        speeds, falls = self._ray_speeds(power, floor / settings.rays, per_bin, rays.cosines)
         return self._average(speeds, falls, delay)
 
     def _push(self, returns: MovingReturns) -> None:
@@ -163,7 +163,7 @@ class PaperSpeed:
         return bool(np.add.reduce(spectrum[half:]) > np.add.reduce(spectrum[:half]))
 
     def _ray_speeds(
-        self, power: NDArray[np.float32], floor: float, per_bin: NDArray[np.float64]
+        self, power: NDArray[np.float32], floor: float, per_bin: float, cosines: list[float]
     ) -> tuple[list[float], list[float]]:
         """Speed over ground (m/s, eq. 2) of the rays that show one, and the heights of their edges.
 
@@ -178,15 +178,13 @@ class PaperSpeed:
         least_peak, last_edge, beyond = settings.least_peak * floor, settings.alias_share * half, self._beyond
         speeds, heights, ambiguous = [], [], 0
         # Plain Python from here on: for a handful of numbers, numpy's calls cost more.
-        for edge, fall, peak, scale in zip(
-            edges.tolist(), falls.tolist(), peaks.tolist(), per_bin.tolist(), strict=True
-        ):
+        for edge, fall, peak, cosine in zip(edges, falls, peaks.tolist(), cosines, strict=True):
             if peak <= least_peak:
                 continue
             if edge > last_edge:
                 ambiguous += 1
             else:
-                speeds.append(max(edge - beyond, 0.0) * scale)
+                speeds.append(max(edge - beyond, 0.0) * per_bin / cosine)
                 heights.append(fall)
         return ([], []) if 4 * ambiguous > settings.rays else (speeds, heights)
 
@@ -203,7 +201,7 @@ class PaperSpeed:
         weights = falls if settings.average == "weighted" else [1.0] * count
         total = sum(weights)
         centre = middle if settings.average == "median" else sum(map(mul, weights, speeds)) / total
-        squares = [(speed - centre) * (speed - centre) for speed in speeds]
+        squares = [(speed - centre) ** 2 for speed in speeds]
         spread = math.sqrt(sum(map(mul, weights, squares)) / total)
         return SpeedEstimate(speed=centre, quality=spread, rays=count, valid=True, delay=delay)
 

@@ -5,6 +5,7 @@ A course is a list of legs. Between two legs the person stands, and turns on the
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
@@ -40,8 +41,8 @@ class CourseSettings:
     speed_variation: NotNegative = 0.7  # sd, in units in which 1 is most of the way from 1.0 to 1.5 m/s
     speed_scale: Positive = 6.0  # m over which the speed changes: "not constant speed" (paper, section 3)
     # A walker eases the speed off in a bend, towards the slowest one: by half where the radius is this
-    slow_radius: Positive = 0.4  # m
-    rounding: Positive = 0.15  # m, sd of the smoothing of a corner: 90 deg become a bend of 0.25 m radius
+    slow_radius: Positive = 0.5  # m
+    rounding: Positive = 0.2  # m, sd of the smoothing of a corner: 90 deg become a bend of 0.3 m radius
     turn_rate: Positive = 150.0 * DEGREE  # rad/s, mean while turning on the spot: about face in 1.2 s
     ramp: Positive = 0.8  # s from standing to walking: one or two steps
     stop_duration: tuple[float, float] = (2.0, 5.0)  # s
@@ -170,44 +171,31 @@ def standing(place: Floats, heading: float, duration: float) -> Trajectory:
 _NODE = 0.02  # m between the points of a curve
 _PACE_NODE = 0.02  # m between the points at which a speed is set
 _SPAN = 0.45  # m/s: the pace stays within 1.0 +- 0.45 m/s, so that bob and rounding leave it in 0.5..1.5
-_SHARP = 110.0 * DEGREE  # rad; a sharper corner is turned on the spot
+_SHARP = 135.0 * DEGREE  # rad; a sharper corner is turned on the spot
 
 
 def _sampled(
     walked: Sequence[_Walked], turns: Sequence[tuple[float, float, float]], time: Floats, ramp: float
 ) -> Trajectory:
     """Position, velocity and heading at every `time`."""
-    first = walked[0]
-    here = first.leg.course.position(np.array([first.leg.start]))[0]
-    position = np.tile(here, (len(time), 1))
-    heading = np.full(len(time), float(first.leg.course.heading(np.array([first.leg.start]))[0]))
-    distance = np.zeros(len(time))
-    turned = sum((by * _eased((time - begins) / (ends - begins)) for begins, ends, by in turns), np.zeros(len(time)))
-    for i, walk in enumerate(walked):
-        until = walked[i + 1].begins if i + 1 < len(walked) else np.inf
+    first = walked[0].leg
+    position = np.tile(first.course.position(np.array([first.start]))[0], (len(time), 1))
+    came = float(first.course.heading(np.array([first.start]))[0])
+    heading, distance = np.full(len(time), came), np.zeros(len(time))
+    for walk, after in zip(walked, [*walked[1:], None], strict=True):
+        course, start, end, _ = walk.leg
+        until = np.inf if after is None else after.begins
         mine = (time >= walk.begins) & (time < until)
         cruise = _cruise(time[mine] - walk.begins, walk.ends - walk.begins, ramp)
         along = np.asarray(CubicSpline(walk.elapsed, walk.along)(cruise), dtype=np.float64)
-        position[mine] = walk.leg.course.position(along)
-        # what a leg turns stays turned; its own heading starts from where the last one and the turn have led
-        started = walk.leg.course.heading(np.array([walk.leg.start]))[0]
-        later = time >= walk.begins
-        came = heading[0] if i == 0 else _at_end(walked[:i], heading[0])
-        change = np.zeros(len(time))
-        change[mine] = walk.leg.course.heading(along) - started
-        change[time >= until] = walk.leg.course.heading(np.array([walk.leg.end]))[0] - started
-        heading[later] = came + change[later]
-        distance[mine] = walk.before + along - walk.leg.start
-    velocity = np.gradient(position, 1.0 / RATE, axis=0)
-    return Trajectory(time, position, velocity, heading + turned, distance)
-
-
-def _at_end(walked: Sequence[_Walked], heading: float) -> float:
-    """Heading after all these legs if nothing was turned on the spot, rad."""
-    for walk in walked:
-        start, end = walk.leg.course.heading(np.array([walk.leg.start, walk.leg.end]))
-        heading += float(end - start)
-    return heading
+        position[mine] = course.position(along)
+        distance[mine] = walk.before + along - start
+        # a course may begin with any multiple of 2 pi: what counts is what it turns from there on
+        heading[mine] = came + course.heading(along) - course.heading(np.array([start]))
+        came += float(np.diff(course.heading(np.array([start, end])))[0])
+    for begins, ends, by in turns:
+        heading += by * _eased((time - begins) / (ends - begins))
+    return Trajectory(time, position, np.gradient(position, 1.0 / RATE, axis=0), heading, distance)
 
 
 def _cruise(time: Floats, lasts: float, ramp: float) -> Floats:
@@ -312,7 +300,7 @@ def _random(low: Floats, high: Floats, settings: CourseSettings, rng: Generator)
     ends = [0, *(np.flatnonzero(turn > _SHARP) + 1).tolist(), len(path) - 1]
     return [
         _whole(_rounded(_dense(path[a : b + 1]), settings.rounding), wait=rng.uniform(0.1, 0.4))
-        for a, b in zip(ends[:-1], ends[1:], strict=True)
+        for a, b in pairwise(ends)
     ]
 
 
