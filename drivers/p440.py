@@ -21,7 +21,7 @@ from caneflow.messages import RadarFrame
 from caneflow.protocols import mrm
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.mrm import RadarConfig, ScanInfo
-from caneflow.protocols.mrm_scans import Scan, ScanAssembler
+from caneflow.protocols.mrm_scans import Scan, ScanAssembler, ScanKey
 from caneflow.protocols.mrm_serial import SerialDeframer, framed
 from caneflow.runtime import Brought, Context, Quiet, Source
 from caneflow.runtime.errors import DataflowError
@@ -38,10 +38,11 @@ TRIES = 4  # of a request to a radar that is there: datagrams get lost
 RETRY_PERIOD = 0.25  # s between two attempts at a radar that is not there
 STOP_TRIES = 3
 STILL_TIME = 0.06  # s without a scan after which a radar that was told to stop has stopped
+MOST_ARRIVALS = 100  # scans under way
 MOST_EARLY = 1000  # packets that may come while an answer is waited for
 
-PATIENCE_MS = 25  # of the radar's clock, for the packets of a scan; longer when scans are rarer
-PATIENCE_PERIODS = 2.5
+PATIENCE_MS = 25  # of the radar's clock, for what others have overtaken ...
+PATIENCE_PERIODS = 4.0  # ... but as long that three scans may overtake one
 BIN_PS = 2  # ps, the finest step of delay, rounded up: how far the radar may move the window's start
 QUANTUM_PS = 5860  # ps, 96 bins of 61.035 ps, rounded up: how far the radar may move its end
 RAW = 1  # scan type: neither filtered nor detected
@@ -367,6 +368,7 @@ class P440(Source):
         self._told = ""  # why there are no frames; "": there are
         self._described = ""  # the radar, as it was described last
         self._assembler = ScanAssembler()  # of this session
+        self._arrivals: dict[ScanKey, int] = {}  # ns, of scans that are not whole yet, or held back
         self._incomplete_before = 0  # scans of which a part came, in the sessions before
         self._lost_told = 0
         self._next_loss_line = 0  # ns
@@ -434,7 +436,9 @@ class P440(Source):
         settings = self._settings
         patience = max(PATIENCE_MS, math.ceil(PATIENCE_PERIODS * settings.scan_period_us / 1e3))
         self._incomplete_before += self._assembler.counts.incomplete_scans
-        self._assembler = assembler = ScanAssembler(patience_ms=patience)
+        self._arrivals.clear()
+        period_ms = settings.nominal_period or math.inf
+        self._assembler = assembler = ScanAssembler(patience_ms=patience, period_ms=period_ms)
         self._framing.restart()
         heard = self._clock.now()
         self._next_loss_line = max(self._next_loss_line, heard + round(FIRST_LOSS_LINE * 1e9))
@@ -444,16 +448,24 @@ class P440(Source):
                 now = self._clock.now()
                 if packet is not None:
                     heard = now
+                    self._note_arrival(packet, now)
                     for scan in assembler.feed(packet):
-                        yield from self._told_frames(scan, now)
+                        yield from self._told_frames(scan)
                 elif (now - heard) / 1e9 >= settings.silence_s:
                     raise Silent(f"has sent no scan for {settings.silence_s:g} s")
         except (Silent, OSError):
             for scan in assembler.finish():
-                yield from self._told_frames(scan, self._clock.now())
+                yield from self._told_frames(scan)
             raise
 
-    def _told_frames(self, scan: Scan, arrival: int) -> Brought:
+    def _note_arrival(self, packet: ScanInfo, now: int) -> None:
+        """Keep when a scan's last packet came: it may be held back for the sake of an older scan."""
+        self._arrivals[packet.timestamp_ms, packet.message_id] = now
+        if len(self._arrivals) > MOST_ARRIVALS:  # of scans that never became whole
+            del self._arrivals[next(iter(self._arrivals))]
+
+    def _told_frames(self, scan: Scan) -> Brought:
+        arrival = self._arrivals.pop((scan.timestamp_ms, scan.message_id), None) or self._clock.now()
         before = self._framing.period
         for frame in self._framing.frames(scan, arrival):
             yield "frame", frame

@@ -20,7 +20,7 @@ from caneflow.messages import RadarFrame, decode, numbered
 from caneflow.messages.rig import read_rig
 from caneflow.protocols import mrm
 from caneflow.protocols.mrm_emulator import Faults, Moment, RadarEmulator, moments_of_log
-from caneflow.protocols.mrm_scans import Scan, parse_log, range_start, range_step, split_scan
+from caneflow.protocols.mrm_scans import Scan, ScanAssembler, parse_log, range_start, range_step, split_scan
 from caneflow.protocols.mrm_serial import SerialDeframer, framed
 from caneflow.runtime import Context, Quiet
 from caneflow.runtime.errors import DataflowError
@@ -221,13 +221,14 @@ def test_with_loss_the_complete_scans_go_on_and_the_others_are_counted(caplog: p
     assert max(np.diff(desk.times)) < 0.08, "the frames go on"
 
 
-def test_reordered_and_doubled_packets_lose_nothing() -> None:
-    scans = [scan(number) for number in range(1000)]
+@pytest.mark.parametrize("samples", [288, 480])
+def test_reordered_and_doubled_packets_lose_nothing(samples: int) -> None:
+    scans = [scan(number, samples=samples) for number in range(1000)]
     desk = Desk(moments(scans), faults=Faults(reorder=0.1, duplicate=0.1)).run()
-    assert desk.radar.counts.reordered > 150
+    assert desk.radar.counts.reordered > 80
     assert same(desk.samples, [s.samples for s in scans])
     lags = np.array(desk.times) - np.array([(f.stamp - EPOCH) / SECOND for f in desk.frames])
-    assert lags.max() < 0.025
+    assert lags.max() < 0.055
     assert np.abs(np.diff([f.stamp for f in desk.frames]) - 10_000_000).max() < 200_000  # ns
 
 
@@ -261,7 +262,7 @@ def test_a_radar_slower_than_asked_is_found_out(caplog: pytest.LogCaptureFixture
 def test_a_silent_radar_is_started_anew(caplog: pytest.LogCaptureFixture) -> None:
     scans = [scan(number) for number in range(400)]
     desk = Desk(moments(scans), faults=Faults(freeze_at=2.0)).run()
-    gap = max(np.diff(desk.times))
+    gap = max(np.diff([f.stamp for f in desk.frames])) / SECOND
     assert 0.5 < gap < 1.1
     assert len(desk.frames) == pytest.approx(400 - 100 * gap, abs=2)
     assert caplog.text.count("no scan for 0.5 s; asking on") == 2  # the freeze, and the end
@@ -274,7 +275,7 @@ def test_an_unplugged_radar_is_back_within_a_second_of_its_return(caplog: pytest
     assert 3.0 < max(np.diff(desk.times)) < 4.0
     assert max(np.diff([f.stamp for f in desk.frames])) / SECOND > 3.0, "the gap is visible"
     assert desk.times[-1] - begin > 7.9
-    assert len(caplog.records) == 4, "silence and why it goes on, once each, now and at the end"
+    assert len(caplog.records) == 3, "silent, gone, and silent at the end"
 
 
 def test_an_absent_radar_is_asked_on_and_time_goes_on(caplog: pytest.LogCaptureFixture) -> None:
@@ -289,6 +290,16 @@ def test_an_absent_radar_is_asked_on_and_time_goes_on(caplog: pytest.LogCaptureF
         "radar: radar at 192.168.1.100, UDP port 21210: Network is unreachable; asking on",
     ]
     brought.close()
+
+
+def test_scans_of_one_packet_come_out_in_order_from_the_first_on() -> None:
+    """Where nothing of a scan has come, only the rhythm tells that it is missing."""
+    packets = [split_scan(scan(number, samples=96))[0] for number in (1, 0, 3, 2, 6, 5, 4, 7, 9, 10, 11, 12, 13, 8)]
+    assembler = ScanAssembler(patience_ms=40, period_ms=10)
+    out = [[s.message_id for s in assembler.feed(packet)] for packet in packets]
+    assert sum(out, []) == list(range(8)), "0 was waited for"
+    assert out[-1] == [], "8 came too late"
+    assert [s.message_id for s in assembler.finish()] == [9, 10, 11, 12, 13]
 
 
 class UnpluggedLink(Link):
@@ -333,7 +344,7 @@ def test_a_radar_that_was_left_scanning_is_stopped_first() -> None:
         mrm.build(mrm.ControlRequest(message_id=77, scan_count=mrm.SCAN_COUNT_FOREVER)), desk.world.time / SECOND
     )
     desk.run(lambda: len(desk.frames) == 100)
-    number = round(desk.times[0] / 0.01)
+    number = round((desk.frames[0].stamp - EPOCH) / SECOND / 0.01)
     assert number > 5, "what it saw before is dropped"
     assert same(desk.samples, [scan(n).samples for n in range(number, number + 100)])
 

@@ -162,7 +162,12 @@ class Running:
 
     def session(self) -> zenoh.Session:
         """A client of the flow, as the tools are."""
-        wait_for(lambda: any(found.pid == self.process.pid for found in running_flows()), "the flow's address")
+
+        def listens() -> bool:
+            assert self.process.poll() is None, self.process.communicate()[0]
+            return any(found.pid == self.process.pid for found in running_flows())
+
+        wait_for(listens, "the flow's address")
         found = next(found for found in running_flows() if found.pid == self.process.pid)
         return open_session(mode="client", connect=[found.endpoint])
 
@@ -550,3 +555,25 @@ def test_verify_names_the_first_difference(cane: Path, walk: Path, tmp_path: Pat
     done = caneflow("verify", cane, walk)
     assert done.returncode == 2
     assert "holds no output of" in done.stderr
+
+
+@pytest.mark.parametrize("victim", ["ground_speed", "fusion", "imu"])
+def test_a_killed_node_goes_on_as_if_nothing_had_happened(
+    cane: Path, walk: Path, tmp_path: Path, start: Callable[..., Running], victim: str
+) -> None:
+    out = tmp_path / "out.mcap"
+    running = start("run", cane, "--replay", walk, "--speed", "0.5", "--record", out)
+    with running.session() as session:
+        for counted in counters(session, running.flow, "fusion"):
+            if counted.outputs["pose"] > 60:
+                break
+        running.node(victim).kill()
+        for counted in counters(session, running.flow, "fusion"):
+            if counted.inputs["imu"].handled > 60 and counted.outputs["pose"] > 200:
+                break
+    output, _ = running.process.communicate(timeout=60)
+    assert running.process.returncode == 0, output
+    assert f"{victim} | ended with killed by SIGKILL; restart 1 of" in output
+    undisturbed = tmp_path / "undisturbed.mcap"
+    assert caneflow("run", cane, "--replay", walk, "--in-process", "--record", undisturbed).returncode == 0
+    assert results(out) == results(undisturbed)

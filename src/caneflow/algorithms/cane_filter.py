@@ -35,7 +35,7 @@ class CaneFilterSettings:
     """What the filter may be told; units on each line."""
 
     # a radar velocity errs alike for 0.1 s (its window, and the speckle it stands on): as white noise, so much more
-    velocity_inflation: Annotated[float, Gt(0)] = 10.0
+    velocity_inflation: Annotated[float, Gt(0)] = 6.0
     speed_noise: Annotated[float, Gt(0)] = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
     speed_patience: Annotated[float, Gt(0)] = 0.5  # s without a velocity before the paper's speed is taken instead
     sideways: Annotated[float, Gt(0)] = 0.15  # m/s, sd of the hand's velocity across the way the cane points (cane.md)
@@ -52,6 +52,9 @@ class CaneFilterSettings:
     motion: WalkMotionSettings = field(default_factory=WalkMotionSettings)
     heading: HeadingSettings = field(default_factory=HeadingSettings)
     heave: HeaveSettings = field(default_factory=HeaveSettings)
+
+
+Floats = NDArray[np.float64]
 
 
 class _Instant(NamedTuple):
@@ -87,16 +90,20 @@ class CaneFilter:
         boresight: Vector,
         pivot: Vector = (0.0, -0.3, 0.0),
         antenna: Vector = (0.0, 0.0, 0.0),
+        motion: WalkMotion | None = None,
     ) -> None:
-        """For a rig: `boresight`, `pivot` (m, IMU to hand) and `antenna` (m, from the IMU), all in the body frame."""
+        """For a rig: `boresight`, `pivot` (m, IMU to hand) and `antenna` (m, from the IMU), all in the body frame.
+
+        `motion` takes the place of the filter's own, for who wants to look into it (cane_smoother.py).
+        """
         self._settings = settings
         self._boresight, self._pivot, self._antenna = boresight, pivot, antenna
         self._clock = SampleClock()
         self._yaw = GyroYaw()
         self._standing = StandingDetector(settings.standing)
         self._pointing = _Pointing(settings.sideways_memory)
-        self._motion = WalkMotion(settings.motion)
-        self._heading = HeadingHypotheses(settings.heading)
+        self._motion = motion or WalkMotion(settings.motion)
+        self.heading = HeadingHypotheses(settings.heading)
         self._heave = HeaveObserver(settings.heave)
         self._start_height: float | None = None  # m, None before the first sample
         self._waiting: deque[_Measured] = deque(maxlen=16)
@@ -116,7 +123,12 @@ class CaneFilter:
     @property
     def gyro_bias(self) -> float:
         """Bias of the gyro about the vertical as the filter has it, rad/s."""
-        return self._heading.bias
+        return self.heading.bias
+
+    @property
+    def yaw_offset(self) -> float:
+        """The gyro's yaw less the chip's, rad."""
+        return self._yaw.offset
 
     def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
         """Take the paper's speed (m/s), which counts only where no velocity comes."""
@@ -174,7 +186,7 @@ class CaneFilter:
         self._use_gait(interval, stands, turn, orientation, gyro)
         after = self._motion.position
 
-        self._heading.move(elapsed, turned, after[0] - before[0], after[1] - before[1])
+        self.heading.move(elapsed, turned, after[0] - before[0], after[1] - before[1])
         self._see_field(orientation)
         self._since_heading += elapsed
         if self._since_heading >= self._settings.heading_interval:
@@ -257,50 +269,32 @@ class CaneFilter:
     def _see_field(self, orientation: Quaternion) -> None:
         """Direction of the field in the gyro's frame; without a magnetometer, of what the chip takes for north."""
         if self._field is None:
-            self._heading.field(self._yaw.offset, from_chip=True)
+            self.heading.field(self._yaw.offset, from_chip=True)
             return
         x, y, _ = rotate(orientation, self._field)
-        self._heading.field(math.atan2(y, x) + self._yaw.offset, from_chip=False)
+        self.heading.field(math.atan2(y, x) + self._yaw.offset, from_chip=False)
         self._field = None
 
     def _follow_heading(self) -> None:
         self._since_heading = 0.0
         biases = self._yaw.level_biases()
         if biases is not None:
-            self._heading.level_biases(*biases)
+            self.heading.level_biases(*biases)
         p = self._motion.covariance
-        self._heading.advance(0.5 * float(p[0, 0] + p[1, 1]))
+        self.heading.advance(0.5 * float(p[0, 0] + p[1, 1]))
 
     def _estimate(self, orientation: Quaternion) -> PoseEstimate:
-        heading = self._heading.heading()
+        heading = self.heading.heading()
         turn = cmath.rect(1.0, heading.yaw)
         velocity = turn * complex(*self._motion.velocity)
         rise = self._heave.height - (self._start_height or 0.0)
+        level = level_covariance(self._motion.covariance, heading, turn, velocity, self._settings.speed_scale)
         return PoseEstimate(
             position=(heading.position.real, heading.position.imag, rise),
             velocity=(velocity.real, velocity.imag, self._heave.rate),
             orientation=multiply(from_yaw(self._yaw.offset + heading.yaw), orientation),
-            covariance=self._covariance(heading, turn, velocity),
+            covariance=with_height(level, self._heave.height_variance, self._heave.rate_variance),
         )
-
-    def _covariance(self, heading: Heading, turn: complex, velocity: complex) -> NDArray[np.float64]:
-        """(6, 6) of position and velocity: the filter's, what the headings add, and the radar's scale."""
-        cos, sin = turn.real, turn.imag
-        turned = np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, cos, -sin], [0, 0, sin, cos]])
-        level = turned @ self._motion.covariance @ turned.T
-        x, y = heading.position.real, heading.position.imag
-        scale, yaw = self._settings.speed_scale**2, heading.yaw_variance
-        level[0, 0] += heading.xx + scale * x * x
-        level[1, 1] += heading.yy + scale * y * y
-        level[0, 1] = level[1, 0] = level[0, 1] + heading.xy + scale * x * y
-        level[2, 2] += yaw * velocity.imag**2
-        level[3, 3] += yaw * velocity.real**2
-        level[2, 3] = level[3, 2] = level[2, 3] - yaw * velocity.real * velocity.imag
-        covariance = np.zeros((6, 6))
-        covariance[:2, :2], covariance[:2, 3:5] = level[:2, :2], level[:2, 2:]
-        covariance[3:5, :2], covariance[3:5, 3:5] = level[2:, :2], level[2:, 2:]
-        covariance[2, 2], covariance[5, 5] = self._heave.height_variance, self._heave.rate_variance
-        return covariance
 
 
 class _Pointing:
@@ -329,6 +323,35 @@ class _Pointing:
             share = min(interval / self._memory, 1.0)
             self.turning += share * ((turned / interval) ** 2 - self.turning)
         return turned
+
+
+def level_covariance(motion: Floats, heading: Heading, turn: complex, velocity: complex, speed_scale: float) -> Floats:
+    """Of horizontal position and velocity (4, 4), given out after a `turn` (cos + j sin) by the heading.
+
+    The filter's `motion` (4, 4), what the headings add, and the radar's scale, of sd `speed_scale`: the heading's
+    error turns the `velocity` (m/s, x + jy), the scale stretches the track.
+    """
+    cos, sin = turn.real, turn.imag
+    turned = np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, cos, -sin], [0, 0, sin, cos]])
+    level: Floats = turned @ motion @ turned.T
+    x, y = heading.position.real, heading.position.imag
+    scale, yaw = speed_scale**2, heading.yaw_variance
+    level[0, 0] += heading.xx + scale * x * x
+    level[1, 1] += heading.yy + scale * y * y
+    level[0, 1] = level[1, 0] = level[0, 1] + heading.xy + scale * x * y
+    level[2, 2] += yaw * velocity.imag**2
+    level[3, 3] += yaw * velocity.real**2
+    level[2, 3] = level[3, 2] = level[2, 3] - yaw * velocity.real * velocity.imag
+    return level
+
+
+def with_height(level: Floats, height_variance: float, rate_variance: float) -> Floats:
+    """(6, 6) of position and velocity from `level` (4, 4) and the variances of height and vertical speed."""
+    covariance = np.zeros((6, 6))
+    covariance[:2, :2], covariance[:2, 3:5] = level[:2, :2], level[:2, 2:]
+    covariance[3:5, :2], covariance[3:5, 3:5] = level[2:, :2], level[2:, 2:]
+    covariance[2, 2], covariance[5, 5] = height_variance, rate_variance
+    return covariance
 
 
 def _horizontal(vector: Vector) -> complex:

@@ -4,17 +4,21 @@ Forward the filter of cane_filter.py. Then backward over its states (Rauch, Tung
 and the whole track anew with the heading that the walk's end has taught.
 """
 
-import math
+import cmath
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
+from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings, level_covariance, with_height
 from caneflow.algorithms.dead_reckoning import PoseEstimate
-from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply
+from caneflow.algorithms.heading_hypotheses import Heading
+from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized
 from caneflow.algorithms.walk_motion import WalkMotion, WalkMotionSettings
 
 Floats = NDArray[np.float64]
+
+_JITTER: Final = 1e-15 * np.eye(7)  # the start is known exactly: its covariance has no inverse
 
 
 class RecordedMotion(WalkMotion):
@@ -26,15 +30,18 @@ class RecordedMotion(WalkMotion):
         self.predicted: list[tuple[Floats, Floats]] = []
         self.transitions: list[Floats] = []
 
-    def predict(
-        self, t: float, acceleration: tuple[float, float], cos_yaw: float, sin_yaw: float
-    ) -> complex:
+    def predict(self, t: float, acceleration: tuple[float, float], cos_yaw: float, sin_yaw: float) -> complex:
         """As the filter's, and remembered."""
         self.corrected.append((np.array(self._x), self._p.copy()))
         gained = super().predict(t, acceleration, cos_yaw, sin_yaw)
         self.predicted.append((np.array(self._x), self._p.copy()))
         self.transitions.append(self._f.copy())
         return gained
+
+    def coast(self, t: float) -> None:
+        """As the filter's; what is predicted over a gap is what is left after it."""
+        super().coast(t)
+        self.predicted[-1] = np.array(self._x), self._p.copy()
 
     def smoothed(self) -> tuple[Floats, Floats]:
         """States (n + 1, 7) and covariances (n + 1, 7, 7) at the start and after each of n predictions."""
@@ -43,7 +50,6 @@ class RecordedMotion(WalkMotion):
         for index in range(len(self.transitions) - 1, -1, -1):
             x_then, p_then = self.corrected[index]
             x_next, p_next = self.predicted[index]
-            # the transition is that of the accelerometer's biases; what was gained is in the predicted state
             gain = np.linalg.solve(p_next + _JITTER, self.transitions[index] @ p_then).T
             x = x_then + gain @ (x - x_next)
             p = p_then + gain @ (p - p_next) @ gain.T
@@ -52,7 +58,13 @@ class RecordedMotion(WalkMotion):
         return np.array(states[::-1]), np.array(covariances[::-1])
 
 
-_JITTER = 1e-15 * np.eye(7)
+class _Sample(NamedTuple):
+    predictions: int  # made before it
+    elapsed: float  # s
+    turned: float  # rad, by the gyro
+    offset: float  # rad, gyro's yaw less the chip's
+    orientation: Quaternion  # the chip's
+    estimate: PoseEstimate  # the filter's
 
 
 class CaneSmoother:
@@ -67,28 +79,14 @@ class CaneSmoother:
         antenna: Vector = (0.0, 0.0, 0.0),
     ) -> None:
         """As for `CaneFilter`."""
-        self._filter = CaneFilter(settings, boresight=boresight, pivot=pivot, antenna=antenna)
+        self._settings = settings
         self._motion = RecordedMotion(settings.motion)
-        self._filter.replace_motion(self._motion)
+        self._filter = CaneFilter(settings, boresight=boresight, pivot=pivot, antenna=antenna, motion=self._motion)
         self._samples: list[_Sample] = []
-
-    def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
-        """As `CaneFilter.speed`."""
-        self._filter.speed(stamp_ns, speed, quality, valid, delay)
-
-    def velocity(
-        self,
-        stamp_ns: int,
-        velocity: tuple[float, float],
-        covariance: tuple[float, float, float],
-        delay: float | None,
-    ) -> None:
-        """As `CaneFilter.velocity`."""
-        self._filter.velocity(stamp_ns, velocity, covariance, delay)
-
-    def magnetic_field(self, mag: Vector) -> None:
-        """As `CaneFilter.magnetic_field`."""
-        self._filter.magnetic_field(mag)
+        # inputs go to the filter as they are
+        self.speed = self._filter.speed
+        self.velocity = self._filter.velocity
+        self.magnetic_field = self._filter.magnetic_field
 
     def imu(
         self,
@@ -98,13 +96,41 @@ class CaneSmoother:
         orientation: Quaternion | None,
         linear_accel: Vector | None,
     ) -> None:
-        """As `CaneFilter.imu`, but for the estimate, which comes with `estimates`."""
+        """As `CaneFilter.imu`, but for the estimates, which come all together at the end."""
         estimate = self._filter.imu(stamp_ns, gyro, accel, orientation, linear_accel)
         assert orientation is not None, "the filter refuses samples without"
-        self._samples.append(
-            _Sample(len(self._motion.transitions), self._filter.gyro_turn, orientation, self._filter.drift, estimate)
-        )
+        elapsed, turned = self._filter.heading.clock
+        sample = _Sample(len(self._motion.transitions), elapsed, turned, self._filter.yaw_offset, orientation, estimate)
+        self._samples.append(sample)
 
     def estimates(self) -> list[PoseEstimate]:
-        """One per IMU sample; the orientation at the start is the filter's."""
-        raise NotImplementedError
+        """One per IMU sample so far, each with all samples before and after it; height is the filter's."""
+        if not self._samples:
+            return []
+        states, covariances = self._motion.smoothed()
+        rows = np.array([sample.predictions for sample in self._samples])
+        states, covariances = states[rows], covariances[rows]
+        times = np.array([(sample.elapsed, sample.turned) for sample in self._samples])
+        places = states[:, 0] + 1j * states[:, 1]
+        hindsight = self._filter.heading.hindsight(times[:, 0], times[:, 1], np.diff(places, prepend=places[:1]))
+        return [
+            _smoothed_estimate(sample, state, covariance, heading, self._settings.speed_scale)
+            for sample, state, covariance, heading in zip(self._samples, states, covariances, hindsight, strict=True)
+        ]
+
+
+def _smoothed_estimate(
+    sample: _Sample, state: Floats, covariance: Floats, heading: Heading, speed_scale: float
+) -> PoseEstimate:
+    before = sample.estimate
+    turn = cmath.rect(1.0, heading.yaw)
+    velocity = turn * complex(state[2], state[3])
+    filtered = before.covariance
+    assert filtered is not None, "the filter gives one"
+    level = level_covariance(covariance[:4, :4], heading, turn, velocity, speed_scale)
+    return PoseEstimate(
+        position=(heading.position.real, heading.position.imag, before.position[2]),
+        velocity=(velocity.real, velocity.imag, before.velocity[2]),
+        orientation=multiply(from_yaw(sample.offset + heading.yaw), normalized(sample.orientation)),
+        covariance=with_height(level, float(filtered[2, 2]), float(filtered[5, 5])),
+    )

@@ -77,8 +77,7 @@ class ClockFit:
     def update(self, reading: int, arrival: int) -> int:
         """The stamp (ns, host) of the scan with clock `reading` (ticks, wrapping) that came at `arrival` (ns, host).
 
-        Readings come in order, arrivals do not decrease. Stamps strictly increase; unless that forbids it, none is
-        later than its arrival.
+        Readings come in order. Stamps strictly increase; unless that forbids it, none is later than its arrival.
         """
         step = 0 if self._reading is None else self._difference(reading, self._reading)
         if step < 0:

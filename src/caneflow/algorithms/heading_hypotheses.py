@@ -32,13 +32,13 @@ _TOO_FEW: Final = 4.0  # biases that carry the weight: fewer, and the grid is to
 class HeadingSettings:
     """What is believed of gyro and field before a walk."""
 
-    biases: Annotated[int, Ge(5)] = 41  # hypotheses of the gyro's bias, three scale errors each
+    biases: Annotated[int, Ge(5)] = 21  # hypotheses of the gyro's bias, three scale errors each
     largest_bias: Annotated[float, Gt(0)] = 0.8 * _DEGREE  # rad/s
     # rad/s, sd of a gyro's bias (cane.md: 0.02 to 0.3 deg/s); all equally likely, gravity's axes tell which it is
     bias_spreads: tuple[float, ...] = (0.025 * _DEGREE, 0.05 * _DEGREE, 0.1 * _DEGREE, 0.2 * _DEGREE, 0.4 * _DEGREE)
     scale_error: Annotated[float, Gt(0)] = 0.007  # sd of the gyro's scale (cane.md)
-    knot_interval: Annotated[float, Gt(0)] = 0.7  # s
-    knots: Annotated[int, Ge(8), MultipleOf(2)] = 128  # kept; when full, every second one goes
+    knot_interval: Annotated[float, Gt(0)] = 1.0  # s
+    knots: Annotated[int, Ge(8), MultipleOf(2)] = 64  # kept; when full, every second one goes
     field_error: Annotated[float, Gt(0)] = 14.0 * _DEGREE  # rad, sd of the field's direction indoors
     field_scale: Annotated[float, Gt(0)] = 1.8  # m over which it changes (cane.md: 10 deg over 2 m)
     rough_error: Annotated[float, Gt(0)] = 3.0 * _DEGREE  # rad, sd of what changes over shorter ways
@@ -132,13 +132,26 @@ class HeadingHypotheses:
         moved = cmath.rect(1.0, self._summary.yaw) * self._pending
         return self._summary._replace(position=self._summary.position + moved)
 
+    @property
+    def clock(self) -> tuple[float, float]:
+        """Time (s) and turn by the gyro (rad) since the start."""
+        return self._elapsed, self._turned
+
+    def hindsight(self, elapsed: Floats, turned: Floats, moves: Complexes) -> list[Heading]:
+        """What today's weights say of n earlier instants: their clocks, (n,), and the moves to each, m, (n,)."""
+        yaws = -(np.outer(elapsed, self._biases) + np.outer(turned, self._scales))
+        tracks = np.cumsum(np.exp(1j * yaws) * moves[:, None], axis=0)
+        return [self._mean(yaw, track) for yaw, track in zip(yaws, tracks, strict=True)]
+
     def _summarise(self) -> None:
-        yaws = self._yaws(self._elapsed, self._turned)
+        self._summary = self._mean(self._yaws(self._elapsed, self._turned), self._tracks)
+
+    def _mean(self, yaws: Floats, tracks: Complexes) -> Heading:
         yaw = float((self._weights * yaws).sum())
-        centre = complex((self._weights * self._tracks).sum())
-        off = self._tracks - centre
+        centre = complex((self._weights * tracks).sum())
+        off = tracks - centre
         x, y = off.real, off.imag
-        self._summary = Heading(
+        return Heading(
             position=centre,
             yaw=yaw,
             yaw_variance=float((self._weights * (yaws - yaw) ** 2).sum()),

@@ -1,5 +1,6 @@
 """Scans of a P440: put together from packets, taken apart into packets, read from logs, with their range axis."""
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import TypeAlias
@@ -16,6 +17,8 @@ ANTENNA_DELAY_PS = 10_000  # ps, path from the module to the stock antennas and 
 LOG_HEAD_BYTES = 32
 CLOCK_SPAN = 1 << 32  # ms, where the radar's clock wraps
 ID_SPAN = 1 << 16
+STEPS_REMEMBERED = 32  # between scans: the shortest of them is their period
+GAP = 1.5  # periods between two scans, and more: there was one in between
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -135,6 +138,25 @@ class _Source:
 
     pending: dict[ScanKey, _Partial] = field(default_factory=dict)
     settled: ScanKey | None = None
+    steps: deque[float] = field(default_factory=lambda: deque(maxlen=STEPS_REMEMBERED))  # ms between settled scans
+
+    def settle(self, key: ScanKey) -> None:
+        """Note that the scan `key` is done with; it leaves what is pending."""
+        if self.settled is not None:
+            self.steps.append(max(milliseconds_after(key[0], self.settled[0]), 1))
+        self.settled = key
+
+    def unseen_for_ms(self, oldest: ScanKey, newest: ScanKey) -> float | None:
+        """How long (ms) ago, at `newest`, a scan was due of which nothing has come.
+
+        It would lie between the settled ones and `oldest`; None when no scan is missing there, as far as is known.
+        """
+        if self.settled is None:  # who knows with which scan it begins
+            return milliseconds_after(newest[0], oldest[0])
+        period = min(self.steps)
+        if milliseconds_after(oldest[0], self.settled[0]) <= GAP * period:
+            return None
+        return milliseconds_after(newest[0], self.settled[0]) - period
 
 
 class ScanAssembler:
@@ -143,6 +165,9 @@ class ScanAssembler:
     Scans leave in the order of the radar's clock. A scan that lacks a packet holds the younger ones back until the
     clock of newer packets is `patience_ms` ahead of it, or `most_pending` scans wait; then it is given up and
     counted. Both bound the memory, with `most_sources` radars remembered at a time.
+
+    With `period_ms`, a scan of which nothing has come yet is waited for likewise: where a scan is one packet,
+    nothing else lets packets that changed places on the way come out in order.
     """
 
     def __init__(
@@ -152,12 +177,14 @@ class ScanAssembler:
         most_pending: int = 16,  # scans per radar
         most_sources: int = 8,
         restart_ms: int = 2000,  # ms: a clock that goes back further was started anew
+        period_ms: float | None = None,  # ms between scans, a guess until some have come; inf: no idea
     ) -> None:
         self.counts = AssemblyCounts()
         self._patience_ms = patience_ms
         self._most_pending = most_pending
         self._most_sources = most_sources
         self._restart_ms = restart_ms
+        self._period_ms = period_ms
         self._sources: dict[int, _Source] = {}
 
     def feed(self, packet: ScanInfo) -> Iterator[Scan]:
@@ -181,6 +208,8 @@ class ScanAssembler:
 
     def _source(self, source_id: int, settled: list[Scan]) -> _Source:
         source = self._sources.pop(source_id, None) or _Source()
+        if not source.steps and self._period_ms is not None:
+            source.steps.append(self._period_ms)
         if len(self._sources) >= self._most_sources:
             longest_silent = next(iter(self._sources))
             settled += self._release(self._sources.pop(longest_silent), everything=True)
@@ -206,12 +235,15 @@ class ScanAssembler:
         pending = source.pending
         while pending:
             oldest, newest = _oldest_and_newest(pending)
-            waited_ms = milliseconds_after(newest[0], oldest[0])
-            overdue = waited_ms > self._patience_ms or len(pending) > self._most_pending
-            if not (pending[oldest].is_complete() or overdue or everything):
+            too_many = len(pending) > self._most_pending
+            overdue = milliseconds_after(newest[0], oldest[0]) > self._patience_ms or too_many
+            unseen_ms = None if self._period_ms is None else source.unseen_for_ms(oldest, newest)
+            waits = unseen_ms is not None and unseen_ms <= self._patience_ms and not too_many
+            ready = not waits and (pending[oldest].is_complete() or overdue)
+            if not (ready or everything):
                 return
             partial = pending.pop(oldest)
-            source.settled = oldest
+            source.settle(oldest)
             scan = partial.scan() if partial.is_complete() else None
             if scan is None:
                 self.counts.incomplete_scans += 1

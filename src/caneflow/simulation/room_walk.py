@@ -41,7 +41,7 @@ class PersonSettings:
     # gait", SPIE 4744, 2002: Lund and Browder's chart), at `limb_share` of it: the trunk is the one large smooth face
     trunk: Positive = 0.6
     trunk_spread: NotNegative = 0.8  # dB, sd between persons
-    limb_share: NotNegative = 0.4  # chosen; see the README of the figures: it sets how predominant the trunk's line is
+    limb_share: NotNegative = 0.4  # chosen
     # Trunk by aspect a from the chest: trunk (1 + aspect cos 2 a), 3 dB between chest and side (chosen)
     aspect: Annotated[float, Ge(0), Gt(-1)] = 0.33
     specular_share: Annotated[float, Ge(0)] = 0.6  # of the trunk's power in one point that glides over it (chosen)
