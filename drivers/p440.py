@@ -46,7 +46,7 @@ PATIENCE_PERIODS = 4.0  # ... but as long that three scans may overtake one
 BIN_PS = 2  # ps, the finest step of delay, rounded up: how far the radar may move the window's start
 QUANTUM_PS = 5860  # ps, 96 bins of 61.035 ps, rounded up: how far the radar may move its end
 RAW = 1  # scan type: neither filtered nor detected
-LOSS_PERIOD = 10.0  # s between two lines about losses
+LOSS_PERIOD = 30.0  # s between two lines about losses
 FIRST_LOSS_LINE = 2.0  # s after the start, when it is known how often the radar scans
 CLOCK_SET = 1_000_000  # ns by which the host's clock must differ from what it was to have been set
 TICKS_PER_SECOND = 1e3  # of the radar's clock
@@ -411,8 +411,7 @@ class P440(Source):
             self._require(radar.start(self._settings.scan_period_us), "to scan")
             yield from self._frames(radar)
         finally:
-            with suppress(OSError):
-                radar.stop()
+            _leave_stopped(radar)
 
     def _configure(self, radar: Radar) -> RadarConfig:
         """Set the radar, wake it first if need be; what it made of the settings."""
@@ -541,6 +540,19 @@ class P440(Source):
                 "%s: %d of %d scans lost, %d of these came in part; %d of no use",
                 *(self._node, framing.lost, made, incomplete, framing.unfit),
             )
+
+
+def _leave_stopped(radar: Radar) -> None:
+    """Stop the radar, if it can be reached; also when the flow is ended while this is under way."""
+    tried = False
+    try:
+        with suppress(OSError):
+            radar.stop()
+        tried = True
+    finally:
+        if not tried:
+            with suppress(OSError):
+                radar.stop()
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ class Doppler(Operator):
 
 
 def range_calibration(sensor: str | None, rig: Rig) -> float | None:
-    """The sensor's k, m^4; None when none is named or it has not been calibrated. Raises MessageError for a stranger."""
+    """The sensor's k, m^4; None when none is named, or not calibrated. Raises MessageError for a stranger."""
     if sensor is None:
         return None
     if sensor not in rig.sensors:

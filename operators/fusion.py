@@ -8,6 +8,7 @@ out  pose  : Pose         one per IMU sample
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
+from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
 from caneflow.algorithms.dead_reckoning import DeadReckoning
 from caneflow.algorithms.kalman import KalmanFilter, KalmanSettings
 from caneflow.algorithms.luenberger import LuenbergerObserver, LuenbergerSettings
@@ -18,7 +19,7 @@ from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 
-Method: TypeAlias = Literal["luenberger", "kalman", "shs", "naive_ins"]
+Method: TypeAlias = Literal["luenberger", "kalman", "shs", "naive_ins", "best"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +31,7 @@ class FusionSettings:
     kalman: KalmanSettings = field(default_factory=KalmanSettings)
     shs: StepHeadingSettings = field(default_factory=StepHeadingSettings)
     naive_ins: NaiveInsSettings = field(default_factory=NaiveInsSettings)
+    best: CaneFilterSettings = field(default_factory=CaneFilterSettings)
 
 
 class Fusion(Operator):
@@ -42,16 +44,25 @@ class Fusion(Operator):
     def __init__(self, settings: FusionSettings, context: Context) -> None:
         self._method = settings.method
         self._estimator = estimator(settings, context.rig)
+        # The paper's methods know one speed; this one knows a velocity and the magnetic field as well.
+        self._cane_filter = self._estimator if isinstance(self._estimator, CaneFilter) else None
 
     def handle(self, port: str, message: Sample) -> Emitted:
         """Yield the pose at an IMU sample's stamp; a speed only informs the estimator."""
         match message:
             case GroundSpeed():
-                self._estimator.speed(message.stamp, message.speed, message.quality, message.valid, message.delay)
+                self._take_speed(message)
             case Imu():
                 yield "pose", self._pose(message)
 
+    def _take_speed(self, ground: GroundSpeed) -> None:
+        if self._cane_filter is not None and ground.velocity is not None and ground.velocity_cov is not None:
+            self._cane_filter.velocity(ground.stamp, ground.velocity, ground.velocity_cov, ground.velocity_delay)
+        self._estimator.speed(ground.stamp, ground.speed, ground.quality, ground.valid, ground.delay)
+
     def _pose(self, imu: Imu) -> Pose:
+        if self._cane_filter is not None and imu.mag is not None:
+            self._cane_filter.magnetic_field(imu.mag)
         try:
             estimate = self._estimator.imu(imu.stamp, imu.gyro, imu.accel, imu.orientation, imu.linear_accel)
         except ValueError as error:
@@ -77,6 +88,13 @@ def estimator(settings: FusionSettings, rig: Rig) -> DeadReckoning:
             return StepHeading(settings.shs, boresight=rig.boresight, step_length=rig.need("step_length"))
         case "naive_ins":
             return NaiveIns(settings.naive_ins)
+        case "best":
+            return CaneFilter(
+                settings.best,
+                boresight=rig.boresight,
+                pivot=rig.need("pivot"),
+                antenna=rig.antenna,
+            )
 
 
 if __name__ == "__main__":

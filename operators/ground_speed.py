@@ -5,16 +5,20 @@ in   imu   : Imu          orientation and gyro
 out  speed : GroundSpeed  one per frame
 """
 
+import math
 from dataclasses import dataclass, field
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
 from caneflow.algorithms.footprint import CaneGeometry
+from caneflow.algorithms.ground_velocity import GroundVelocityEstimator, GroundVelocitySettings
 from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
-from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings
+from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
 from caneflow.messages import GroundSpeed, Imu, RadarFrame, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
+
+NO_SPEED = SpeedEstimate(speed=0.0, quality=math.inf, rays=0, valid=False, delay=0.0)  # the paper's front end is off
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,11 +26,18 @@ class GroundSpeedSettings:
     """What is common to all front ends, and what each may be told."""
 
     moving_returns: MovingReturnsSettings = field(default_factory=MovingReturnsSettings)
+    with_speed: bool = True  # fill `speed` and `quality`, by the paper's front end
+    with_velocity: bool = True  # fill `velocity` and `velocity_cov`, by the pulse pair
     paper: PaperSpeedSettings = field(default_factory=PaperSpeedSettings)
+    ground_velocity: GroundVelocitySettings = field(default_factory=GroundVelocitySettings)
+
+    def __post_init__(self) -> None:
+        if not (self.with_speed or self.with_velocity):
+            raise ValueError("with_speed and with_velocity are both false; there would be nothing to say")
 
 
 class GroundSpeedOperator(Operator):
-    """The paper's front end (eq. 1-4) on a sliding window."""
+    """The paper's front end (eq. 1-4) on a sliding window, and the pulse pair beside it, on the same moving returns."""
 
     inputs = {"frame": RadarFrame, "imu": Imu}
     outputs = {"speed": GroundSpeed}
@@ -34,7 +45,9 @@ class GroundSpeedOperator(Operator):
 
     def __init__(self, settings: GroundSpeedSettings, context: Context) -> None:
         self._moving_returns = MovingReturnsFilter(settings.moving_returns)
-        self._paper = PaperSpeed(settings.paper, geometry(context.rig))
+        rig = geometry(context.rig)
+        self._paper = PaperSpeed(settings.paper, rig) if settings.with_speed else None
+        self._velocity = GroundVelocityEstimator(settings.ground_velocity, rig) if settings.with_velocity else None
         self._attitudes = AttitudeHistory()
 
     def handle(self, port: str, message: Sample) -> Emitted:
@@ -49,6 +62,8 @@ class GroundSpeedOperator(Operator):
         if imu.orientation is None:
             raise Refused("the IMU sample has no orientation; put operators.attitude in front of ground_speed")
         self._attitudes.add(imu.stamp, imu.orientation, imu.gyro)
+        if self._velocity is not None:
+            self._velocity.imu(imu.stamp, imu.orientation, imu.accel)
 
     def _speed(self, frame: RadarFrame) -> GroundSpeed:
         parameters = RadarParameters(
@@ -62,14 +77,18 @@ class GroundSpeedOperator(Operator):
             returns = self._moving_returns.update(frame.stamp, frame.scans, parameters)
         except ValueError as error:
             raise Refused(str(error)) from error
-        estimate = self._paper.update(returns, self._attitudes)
+        speed = self._paper.update(returns, self._attitudes) if self._paper is not None else NO_SPEED
+        velocity = self._velocity.update(returns, self._attitudes) if self._velocity is not None else None
         return GroundSpeed(
             stamp=frame.stamp,
-            speed=estimate.speed,
-            quality=estimate.quality,
-            rays=estimate.rays,
-            valid=estimate.valid,
-            delay=estimate.delay,
+            speed=speed.speed,
+            quality=speed.quality,
+            rays=speed.rays,
+            valid=speed.valid,
+            delay=speed.delay,
+            velocity=velocity.velocity if velocity is not None else None,
+            velocity_cov=velocity.covariance if velocity is not None else None,
+            velocity_delay=velocity.delay if velocity is not None else None,
         )
 
 

@@ -18,14 +18,15 @@ from annotated_types import Gt
 
 from caneflow.algorithms.dead_reckoning import heading_of
 from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
-from caneflow.algorithms.room_tracking import Echo, RoomTracker, StaticSensor, Vector2
-from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw
+from caneflow.algorithms.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
+from caneflow.algorithms.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor
+from caneflow.algorithms.rotations import Quaternion, from_yaw
 from caneflow.messages import DopplerTarget, Imu, MessageError, Pose, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import ANY_PORT, Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 
-Method: TypeAlias = Literal["ekf", "best"]
+Method: TypeAlias = Literal["particle", "heading_particle", "ekf", "best"]
 
 IMU = "imu"
 SLOWEST_TO_FACE = 0.2  # m/s; without an IMU a slower velocity does not tell which way the person faces
@@ -42,7 +43,10 @@ class RoomTrackerSettings:
     period: Annotated[float, Gt(0)] = 0.05  # s between poses
     forward: tuple[float, float, float] = (1.0, 0.0, 0.0)  # the way the person faces, in the IMU's axes
     silent_after: Annotated[float, Gt(0)] = 0.5  # s without a sample, after which a sensor counts as silent
+    particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
+    heading_particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
     ekf: RoomEkfSettings = field(default_factory=RoomEkfSettings)
+    best: RoomEkfSettings = field(default_factory=RoomEkfSettings)
 
 
 class RoomTrackerOperator(Operator):
@@ -114,7 +118,7 @@ class RoomTrackerOperator(Operator):
     def _described(self, stamp: int) -> str:
         """The method, and what the pose has to do without."""
         silent = [sensor for sensor in self._heard_ns if self._is_silent(sensor, stamp)]
-        parts = [self._settings.method]
+        parts: list[str] = [self._settings.method]
         if not self._tracker.moving:
             parts.append("static_or_lost")
         if silent:
@@ -129,9 +133,16 @@ class RoomTrackerOperator(Operator):
 
 def tracker(settings: RoomTrackerSettings, context: Context, names: list[str]) -> RoomTracker:
     """The tracker that `method` names, with the sensors `names` of the rig; raises MessageError for a stranger."""
-    sensors = sensors_of(context.rig, names)
-    start, error = start_of(context.rig)
-    return RoomEkf(settings.ekf, sensors, start, error)
+    sensors, start = sensors_of(context.rig, names), start_of(context.rig)
+    match settings.method:
+        case "particle":
+            return ParticleTracker(settings.particle, sensors, start, context.random)
+        case "heading_particle":
+            return HeadingParticleTracker(settings.heading_particle, sensors, start, context.random)
+        case "ekf":
+            return RoomEkf(settings.ekf, sensors, start)
+        case "best":
+            return RoomEkf(settings.best, sensors, start)
 
 
 def sensors_of(rig: Rig, names: list[str]) -> Mapping[str, StaticSensor]:
@@ -150,12 +161,11 @@ def sensors_of(rig: Rig, names: list[str]) -> Mapping[str, StaticSensor]:
     }
 
 
-def start_of(rig: Rig) -> tuple[Vector2, Vector2]:
-    """The guess of the start and its sd, m; without one the middle of the area, and all of it."""
+def start_of(rig: Rig) -> RoomStart:
+    """The user's guess, else anywhere in the area; raises MessageError when neither is known."""
     if rig.start is not None:
-        return rig.start.position, (rig.start.sd, rig.start.sd)
-    west, east, south, north = rig.need("area")
-    return (0.5 * (west + east), 0.5 * (south + north)), ((east - west) / 12**0.5, (north - south) / 12**0.5)
+        return RoomStart(guess=rig.start.position, error=rig.start.sd, area=rig.area)
+    return RoomStart(area=rig.need("area"))
 
 
 def echo_of(target: DopplerTarget) -> Echo:

@@ -152,7 +152,8 @@ def test_the_line_is_that_of_the_linear_program(seed: int) -> None:
     solved = linprog(
         [-scaled.sum(), -39.0], A_ub=np.stack([scaled, np.ones(39)], 1), b_ub=delays[:-1], bounds=(None, None)
     )
-    slope = solved.x[0] / 1e9
+    assert solved.x is not None
+    slope = float(solved.x[0]) / 1e9
     expected = slope * x + (delays - slope * x).min()
     found = np.array([line.at(device) for device in x]) - HOST - x
     assert found == pytest.approx(expected, abs=1e3)  # 1 us, of 3 ms

@@ -106,15 +106,21 @@ def test_pictures_are_small_and_the_same_every_time(tmp_path: Path) -> None:
 
 
 def test_the_fingerprint_is_of_what_the_code_does(tmp_path: Path) -> None:
-    source = tmp_path / "walk.py"
+    walks = tmp_path / "walks.py"
+    walks.write_text("from here.steps import f\nfrom here import shoes\n")
+    (tmp_path / "shoes.py").write_text("from here.walks import f\n")
 
     def of(text: str) -> str:
-        source.write_text(text)
-        return experiments.fingerprint(tmp_path)
+        (tmp_path / "steps.py").write_text(text)
+        return experiments.fingerprint(walks)
 
     plain = of("def f(x):\n    return x + 1\n")
-    assert of('"""A walk."""\n\ndef f(x):\n    """One more."""\n    return (x + 1)  # why\n') == plain
+    assert of('"""A step."""\n\ndef f(x):\n    """One more."""\n    return (x + 1)  # why\n') == plain
     assert of("def f(x):\n    return x + 2\n") != plain
+    (tmp_path / "rooms.py").write_text("nothing = 'to do with walks'\n")
+    assert of("def f(x):\n    return x + 1\n") == plain
+    (tmp_path / "shoes.py").write_text("size = 42\n")
+    assert of("def f(x):\n    return x + 1\n") != plain
 
 
 def test_a_walk_that_cannot_be_simulated_is_an_error_that_says_why(tmp_path: Path) -> None:

@@ -76,9 +76,7 @@ def room(
     print(f"{'sensor':10}{'k':>10}{'spread':>10}{'exponent':>10}{'hops':>7}{'floor':>10}")
     for name, each in found.items():
         floor = 10.0 * math.log10(float(np.median(floors[name])))
-        print(
-            f"{name:10}{each.k:10.4g}{each.spread:7.1f} dB{each.exponent:10.1f}{each.hops:7}{floor:7.1f} dB"
-        )
+        print(f"{name:10}{each.k:10.4g}{each.spread:7.1f} dB{each.exponent:10.1f}{each.hops:7}{floor:7.1f} dB")
     print(f"{output}: for `caneflow run --rig {output}`; the floor is that of one line, full scale = 0 dB")
 
 

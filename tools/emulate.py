@@ -234,10 +234,11 @@ def p440(
     duplicate: Annotated[float, typer.Option(min=0, max=1, help="Part of the scan packets that come twice.")] = 0.0,
     freeze: Annotated[
         float | None,
-        typer.Option(metavar="S", help="s of the recording after which no scans come, until it is started anew."),
+        typer.Option(metavar="AT", help="From AT on no scans come, until it is started anew."),
     ] = None,
-    unplug: Annotated[float | None, typer.Option(metavar="S", help="s of the recording at which power fails.")] = None,
-    unplug_for: Annotated[float, typer.Option(min=0, metavar="S", help="s until power comes back.")] = 3.0,
+    unplug: Annotated[
+        str | None, typer.Option(metavar="AT:FOR", help="From AT, for FOR s, it has no power; then it has booted.")
+    ] = None,
     begin: Annotated[
         float | None,
         typer.Option(metavar="UNIX", help="Unix time (s) at which the recording begins; else with the first start."),
@@ -246,11 +247,13 @@ def p440(
 ) -> None:
     """Be a P440 on UDP that sees what was recorded, once, in real time. Ends with the recording.
 
+    AT is in s of the recording.
+
     Example: caneflow emulate p440 walk.mcap --loss 0.02 & caneflow run dataflow.yaml --set radar.host=127.0.0.1
     """
     is_log = not _starts_with(recording, MCAP)
     config, moments = _moments_of_log(recording) if is_log else _moments_of_recording(recording, stream)
-    never = float("inf")
+    unplug_at, unplug_for = (math.inf, 0.0) if unplug is None else _span(unplug)
     radar = mrm_emulator.RadarEmulator(
         moments,
         config=config,
@@ -259,16 +262,16 @@ def p440(
             loss=loss,
             reorder=reorder,
             duplicate=duplicate,
-            freeze_at=never if freeze is None else freeze,
-            unplug_at=never if unplug is None else unplug,
+            freeze_at=math.inf if freeze is None else freeze,
+            unplug_at=unplug_at,
             unplug_for=unplug_for,
         ),
         begin=None if begin is None else time.monotonic() + begin - time.time(),
     )
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
             udp.bind((host, port))
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
             print(f"P440 of {recording} on {host}, UDP port {udp.getsockname()[1]}", flush=True)
             _serve_p440(radar, udp)
         print("the recording is over", flush=True)
@@ -277,7 +280,7 @@ def p440(
     finally:
         counts = radar.counts
         print(
-            f"{'left scanning' if radar.scanning else 'stopped'}; "
+            f"{'scanning' if radar.scanning else 'stopped'}; "
             f"{counts.requests} requests, {counts.unknown} not understood; "
             f"{counts.scans} {'packets' if is_log else 'scans'} played, {counts.packets} datagrams sent, "
             f"{counts.lost} lost, {counts.reordered} reordered, {counts.duplicated} doubled",

@@ -8,7 +8,7 @@ import statistics
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,17 +21,17 @@ from rich.console import Console
 from rich.progress import track
 
 import caneflow
-from caneflow import simulation
 from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
 from caneflow.algorithms.track_errors import aligned
 from caneflow.errors import CaneflowError
 from caneflow.runtime.dataflow import load
 from caneflow.runtime.evaluation import Evaluation, chosen_methods, evaluated
+from caneflow.simulation import scenario as walk_scenarios
 
 Item = TypeVar("Item")
 
 FAILED_STATUS = 1
-SIMULATOR = Path(str(simulation.__file__)).parent
+WALKS = Path(walk_scenarios.__file__)
 ONE_WALK = "swing"  # the scenario of Table I, and of the picture with tracks
 PICTURED = ("luenberger", "best")  # methods whose tracks are drawn, where fusion has them
 NAMES = {"luenberger": "Luenberger", "kalman": "Kalman", "shs": "adapted SHS", "naive_ins": "naive INS"}
@@ -133,11 +133,11 @@ def command(
         raise typer.Exit(FAILED_STATUS)
 
 
-def fingerprint(sources: Path = SIMULATOR) -> str:
-    """Of the simulator's code, comments and layout aside: walks of another simulator are other walks."""
+def fingerprint(walks: Path = WALKS) -> str:
+    """Of the code that makes walks, comments and layout aside: walks of another simulator are other walks."""
     digest = hashlib.sha256()
-    for source in sorted(sources.glob("*.py")):
-        digest.update(ast.dump(_without_docstrings(ast.parse(source.read_text(encoding="utf-8")))).encode())
+    for source in sorted(_with_imports(walks, {})):
+        digest.update(source.encode())
     return digest.hexdigest()[:12]
 
 
@@ -190,6 +190,19 @@ def _scenarios(only: str | None) -> list[str]:
         if word not in EXPERIMENTS:
             raise CaneflowError(f"--only {word}: no such experiment; there are {', '.join(EXPERIMENTS)}")
     return list(dict.fromkeys(wanted))
+
+
+def _with_imports(source: Path, known: dict[Path, str]) -> Iterable[str]:
+    """The code of a module of the simulator, and of those beside it that it imports."""
+    tree = ast.parse(source.read_text(encoding="utf-8"))
+    known[source] = ast.dump(_without_docstrings(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            for name in (node.module.rpartition(".")[2], *(each.name for each in node.names)):
+                beside = source.with_name(f"{name}.py")
+                if beside not in known and beside.exists():
+                    _with_imports(beside, known)
+    return known.values()
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
@@ -251,7 +264,8 @@ would do.
 
 Seeds are 1 to {seeds}: walk N is what `caneflow simulate walk --scenario NAME --seed N` writes. All methods get
 the same walks with the settings of `dataflow.yaml`, nothing set per walk or scenario, and never the truth. Errors
-are horizontal, the estimate laid on the truth at the start by position and yaw only.
+are horizontal, the estimate laid on the truth at the start by position and yaw only. A seed draws the same random
+numbers for person, scene, radar and IMU in every scenario, so scenarios are not independent of each other; seeds are.
 
 * *end - start*: from the end of the estimate to its start, the paper's error; none but on a closed walk.
 * *end error*: from the end of the estimate to that of the truth. *ATE*: root mean square of that distance over
@@ -375,7 +389,7 @@ def _pyplot() -> Any:
 
 
 def _draw_tracks(pyplot: Any, evaluations: Sequence[Evaluation], methods: Sequence[str], path: Path) -> None:
-    """The tracks of all walks, a panel per method, aligned as the errors are."""
+    """The tracks of all walks, a panel per method, aligned as the errors are; clockwise ones mirrored."""
     figure, panels = pyplot.subplots(
         1, len(methods), figsize=(4.6 * len(methods), 3.4), sharex=True, sharey=True, squeeze=False
     )
@@ -384,6 +398,8 @@ def _draw_tracks(pyplot: Any, evaluations: Sequence[Evaluation], methods: Sequen
             if each.truth is None or method not in each.tracks:
                 continue
             estimated, true, _ = aligned(each.tracks[method], each.truth)
+            way = np.array([1.0, 1.0 if true[:, 1].mean() > 0.0 else -1.0])
+            estimated, true = estimated * way, true * way
             panel.plot(*true.T, color=FAINT, linewidth=0.6, zorder=1)
             (line,) = panel.plot(*estimated.T, linewidth=0.9, alpha=0.85, zorder=2)
             panel.plot(*estimated[-1], "o", color=line.get_color(), markersize=4, zorder=3)

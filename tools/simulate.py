@@ -1,20 +1,25 @@
-"""`caneflow simulate`: a recording of a walk that nobody walked, with the truth beside it."""
+"""`caneflow simulate`: recordings of walks that nobody walked, with the truth beside them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias
 
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from caneflow.messages import Imu, Pose, RadarFrame, Sample, numbered, sample_key
+from caneflow.messages import DopplerBlock, Imu, Pose, RadarFrame, Sample, numbered, sample_key
 from caneflow.recording import TRUTH, RecordingWriter, require_writable
+from caneflow.simulation.doppler_module import Kind
+from caneflow.simulation.room_course import RoomShape
+from caneflow.simulation.room_scenario import PARTS, SENSORS, Part, RoomRecording, World, room_settings, simulate_room
 from caneflow.simulation.scenario import SCENARIOS, Walk, simulate_walk
 
-FLOW = "cane"
+CANE, ROOM = "cane", "room"  # flows
 IMU, RADAR = ("imu", "imu"), ("radar", "frame")
+
+Samples: TypeAlias = Iterator[tuple[tuple[str, str], int, Sample]]  # node and port, number within the stream, sample
 
 
 def walk(
@@ -35,55 +40,149 @@ def walk(
     require_writable(output)
     with progress_bar(f"{scenario}, seed {seed}") as progress:
         walked = simulate_walk(scenario, seed, duration, progress)
-    with RecordingWriter(output, flow=FLOW, source="simulated", rig=dict(walked.rig)) as writer:
-        for seq, samples in enumerate(samples_of(walked)):
-            for name, sample in samples:
-                payload, stamp = numbered(sample, seq), sample.stamp
-                writer.write(sample_key(FLOW, *name), type(sample), payload, stamp=stamp, seq=seq, log_time=stamp)
+    written(output, CANE, walked.rig, samples_of(walked))
     seconds = float(walked.stamps_ns[-1] - walked.stamps_ns[0]) / 1e9
     print(f"{output}: {scenario}, seed {seed}: {len(walked.stamps_ns)} samples a stream, {seconds:.2f} s")
 
 
-def samples_of(walked: Walk) -> Iterator[tuple[tuple[tuple[str, str], Sample], ...]]:
-    """At each instant what the IMU and the radar say, and the truth; by node and port."""
+def room(
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR|REC",
+            help="Folder, or REC.mcap for the course; the other parts are named after it: REC_empty.mcap ...",
+        ),
+    ],
+    seed: Annotated[int, typer.Option(min=0, help="Of the installation: mounting, modules, walls, field.")] = 1,
+    person: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the person: body, gait, belt; by default the same number.")
+    ] = None,
+    course: Annotated[RoomShape, typer.Option(help="Where the person walks.")] = "circle",
+    modules: Annotated[Kind, typer.Option(help="One mixer (int16) or two (complex64).")] = "real",
+    sensors: Annotated[int, typer.Option(min=2, max=len(SENSORS), help=f"The first of {', '.join(SENSORS)}.")] = 2,
+    world: Annotated[World, typer.Option(help="How strongly floor and walls reflect.")] = "nominal",
+    part: Annotated[
+        Literal[Part, "all"], typer.Option(help="The empty room, a calibration walk along an axis, or the course.")
+    ] = "all",
+    stops: Annotated[
+        int | None, typer.Option(min=0, help="How often the person stands still; by default as fits the course.")
+    ] = None,
+) -> None:
+    """Simulate an installation of Doppler modules and a person in it, who wears an IMU.
+
+    Example: caneflow simulate room --seed 3 --course random --modules iq -o rooms/
+    """
+    settings = room_settings(course, modules=modules, sensors=sensors, world=world, stops=stops)
+    names = room_names(output, f"{world}_{modules}{sensors}_{course}_{seed}", part)
+    for path in names.values():
+        require_writable(path)
+    for one, path in names.items():
+        with progress_bar(f"{one}, seed {seed}") as progress:
+            recorded = simulate_room(settings, one, seed, person, progress)
+            written(path, ROOM, recorded.rig, room_samples(recorded))
+        blocks = len(recorded.block_stamps_ns)
+        print(f"{path}: {one}, seed {seed}: {blocks} blocks a module, {len(recorded.stamps_ns) / 100:.2f} s")
+
+
+def room_names(output: Path, name: str, part: Literal[Part, "all"]) -> dict[Part, Path]:
+    """The file of each part that is asked for. A folder is made where there is none; one part may have any name."""
+    base = output
+    if output.suffix != ".mcap":
+        output.mkdir(exist_ok=True)
+        base = output / f"{name}.mcap"
+    elif part != "all":
+        return {part: output}
+    paths = {one: base if one == "course" else base.with_stem(f"{base.stem}_{one}") for one in PARTS}
+    return paths if part == "all" else {part: paths[part]}
+
+
+def written(output: Path, flow: str, rig: Mapping[str, object], samples: Samples) -> None:
+    """Write a recording of samples that come in the order of their stamps."""
+    with RecordingWriter(output, flow=flow, source="simulated", rig=dict(rig)) as writer:
+        for name, seq, sample in samples:
+            payload, stamp = numbered(sample, seq), sample.stamp
+            writer.write(sample_key(flow, *name), type(sample), payload, stamp=stamp, seq=seq, log_time=stamp)
+
+
+def samples_of(walked: Walk) -> Samples:
+    """At each instant what the IMU and the radar say, and the truth."""
     imu = walked.imu
     for i, stamp in enumerate(walked.stamps_ns.tolist()):
         yield (
-            (
-                IMU,
-                Imu(
-                    stamp=stamp,
-                    gyro=tuple(imu.gyro[i].tolist()),
-                    accel=tuple(imu.accel[i].tolist()),
-                    mag=tuple(imu.mag[i].tolist()),
-                    orientation=tuple(imu.orientation[i].tolist()),
-                    linear_accel=tuple(imu.linear_accel[i].tolist()),
-                    calibration=tuple(imu.calibration[i].tolist()),
-                ),
-            ),
-            (
-                RADAR,
-                RadarFrame(
-                    stamp=stamp,
-                    scans=walked.scans[i : i + 1],
-                    scan_period=walked.scan_period,
-                    range_start=walked.range_start,
-                    range_step=walked.range_step,
-                    carrier=walked.carrier,
-                    bandwidth=walked.bandwidth,
-                ),
-            ),
-            (
-                TRUTH,
-                Pose(
-                    stamp=stamp,
-                    position=tuple(walked.position[i].tolist()),
-                    velocity=tuple(walked.velocity[i].tolist()),
-                    orientation=tuple(walked.orientation[i].tolist()),
-                    method="truth",
-                ),
+            IMU,
+            i,
+            Imu(
+                stamp=stamp,
+                gyro=tuple(imu.gyro[i].tolist()),
+                accel=tuple(imu.accel[i].tolist()),
+                mag=tuple(imu.mag[i].tolist()),
+                orientation=tuple(imu.orientation[i].tolist()),
+                linear_accel=tuple(imu.linear_accel[i].tolist()),
+                calibration=tuple(imu.calibration[i].tolist()),
             ),
         )
+        yield (
+            RADAR,
+            i,
+            RadarFrame(
+                stamp=stamp,
+                scans=walked.scans[i : i + 1],
+                scan_period=walked.scan_period,
+                range_start=walked.range_start,
+                range_step=walked.range_step,
+                carrier=walked.carrier,
+                bandwidth=walked.bandwidth,
+            ),
+        )
+        yield TRUTH, i, true_pose(walked, i)
+
+
+def room_samples(recorded: RoomRecording) -> Samples:
+    """What IMU and modules say, and the truth, in the order of the stamps."""
+    imu, block = recorded.imu, 0
+    for i, stamp in enumerate(recorded.stamps_ns.tolist()):
+        while block < len(recorded.block_stamps_ns) and recorded.block_stamps_ns[block] < stamp:
+            yield from module_samples(recorded, block)
+            block += 1
+        yield (
+            IMU,
+            i,
+            Imu(
+                stamp=stamp,
+                gyro=tuple(imu.gyro[i].tolist()),
+                accel=tuple(imu.accel[i].tolist()),
+                mag=tuple(imu.mag[i].tolist()),
+            ),
+        )
+        yield TRUTH, i, true_pose(recorded, i)
+    for last in range(block, len(recorded.block_stamps_ns)):
+        yield from module_samples(recorded, last)
+
+
+def module_samples(recorded: RoomRecording, block: int) -> Samples:
+    """One block of every module."""
+    stamp = int(recorded.block_stamps_ns[block])
+    for name, samples in recorded.blocks.items():
+        yield (
+            (name, "block"),
+            block,
+            DopplerBlock(
+                stamp=stamp, samples=samples[block], sample_rate=recorded.sample_rate, carrier=recorded.carrier
+            ),
+        )
+
+
+def true_pose(simulated: Walk | RoomRecording, i: int) -> Pose:
+    """Where it truly was at instant `i`."""
+    return Pose(
+        stamp=int(simulated.stamps_ns[i]),
+        position=tuple(simulated.position[i].tolist()),
+        velocity=tuple(simulated.velocity[i].tolist()),
+        orientation=tuple(simulated.orientation[i].tolist()),
+        method="truth",
+    )
 
 
 @contextmanager
@@ -95,4 +194,4 @@ def progress_bar(text: str) -> Iterator[Callable[[float], None]]:
         yield lambda done: bar.update(task, completed=done)
 
 
-commands = {"walk": walk}
+commands = {"walk": walk, "room": room}

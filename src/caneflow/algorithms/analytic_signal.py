@@ -41,9 +41,10 @@ class AnalyticSignal:
 
     def __call__(self, scans: NDArray[np.number]) -> NDArray[np.complex64]:
         """The analytic signals of real `scans`, shape (..., bins); same shape."""
-        one_sided = np.fft.rfft(scans.astype(np.float32))[..., self._first : self._end]
+        # Without a factor of its own (norm="backward") numpy would transform forward in double precision.
+        one_sided = np.fft.rfft(scans.astype(np.float32), norm="forward")
         spectrum = np.zeros(scans.shape, np.complex64)
-        np.multiply(one_sided, 2 / self._bins, out=spectrum[..., self._first : self._end])
-        # "forward": the inverse's 1 / bins is in the factor already
-        signal: NDArray[np.complex64] = np.fft.ifft(spectrum, norm="forward")
+        band = slice(self._first, self._end)
+        np.multiply(one_sided[..., band], 2 * self._bins, out=spectrum[..., band])
+        signal: NDArray[np.complex64] = np.fft.ifft(spectrum)
         return signal

@@ -58,7 +58,7 @@ class SlidingSpectrum:
 
     @property
     def delay(self) -> float:
-        """s by which a spectrum lags the stamp of its last sample: half the window."""
+        """Seconds by which a spectrum lags the stamp of its last sample: half the window."""
         return 0.5 * self._settings.window
 
     def update(
@@ -172,4 +172,5 @@ class NoiseFloor:
         else:
             np.minimum(self._minima[-1], self._smooth, out=self._minima[-1])
         self._count += 1
-        return np.maximum(np.min(self._minima, axis=0) / FLOOR_BIAS, LEAST_POWER)
+        lowest = np.asarray(np.min(self._minima, axis=0), dtype=np.float64)
+        return np.maximum(lowest / FLOOR_BIAS, LEAST_POWER)

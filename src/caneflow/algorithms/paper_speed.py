@@ -149,7 +149,8 @@ class PaperSpeed:
         In sum over three bins, most of a range cell apart, the edge lies where the expected spectrum has it.
         """
         np.multiply(self._window.rows(rays.rows), self._weights, out=self._padded[:, : self._settings.window])
-        power: NDArray[np.float32] = np.abs(np.fft.fft(self._padded))
+        # Power is compared with power only. Without a factor (norm="backward") numpy would go over to double.
+        power: NDArray[np.float32] = np.abs(np.fft.fft(self._padded, norm="forward"))
         power *= power
         summed = power[:-2] + power[1:-1]
         summed += power[2:]

@@ -40,15 +40,12 @@ class Particles:
         self.weights = weights
 
     def renew(self, random: np.random.Generator) -> bool:
-        """Remove small particles and resample when few are effective; whether it did."""
+        """When few particles are effective, remove the small ones and resample; whether it did."""
         count = len(self.weights)
-        small = self.weights < self._settings.smallest / count
-        if small.any():
-            self.weights[small] = 0.0
-            self.weights /= self.weights.sum()
         if effective_number(self.weights) >= self._settings.resample_below * count:
             return False
-        self.states = self.states[:, systematic(self.weights, random)]
+        weights = np.where(self.weights < self._settings.smallest / count, 0.0, self.weights)
+        self.states = self.states[:, systematic(weights, random)]
         self.weights = np.full(count, 1.0 / count)
         return True
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def systematic(weights: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.intp]:
-    """Indices, shape (N,), increasing, of the particles to copy; `weights`, shape (N,), sum to 1 and are not negative."""
+    """Indices, shape (N,), increasing, of the particles to copy; `weights`, shape (N,), are not negative."""
     count = len(weights)
     cumulated = np.cumsum(weights)
     cumulated /= cumulated[-1]  # rounding must not leave a tooth beyond the last particle

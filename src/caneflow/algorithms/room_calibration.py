@@ -41,7 +41,7 @@ class RangeCalibration:
 
 
 def range_calibration(amplitudes: Floats, ranges: Floats, settings: CalibrationSettings) -> RangeCalibration | None:
-    """k from amplitudes (full scale = 1) and ranges (m) of valid hops, both shape (H,); None when there are too few."""
+    """The k of amplitudes (full scale = 1) and ranges (m) of valid hops, both shape (H,); None: too few."""
     counts = (ranges >= settings.nearest) & (ranges <= settings.farthest) & (amplitudes > 0.0)
     hops = int(counts.sum())
     if hops < settings.least_hops:
@@ -63,7 +63,13 @@ def sight(sensor: StaticSensor, positions: Floats) -> tuple[Floats, Floats]:
 
 
 def integrated_ranges(
-    seconds: Floats, range_rates: Floats, valid: NDArray[np.bool_], start: float, settings: CalibrationSettings, *, signed: bool
+    seconds: Floats,
+    range_rates: Floats,
+    valid: NDArray[np.bool_],
+    start: float,
+    settings: CalibrationSettings,
+    *,
+    signed: bool,
 ) -> Floats:
     """Distance over time, shape (H,), m, of a walk that starts `start` m away.
 

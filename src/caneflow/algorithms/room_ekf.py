@@ -24,13 +24,12 @@ from numpy.typing import NDArray
 from caneflow.algorithms.room_tracking import (
     DECIBEL,
     LEAST_DISTANCE,
-    Area,
     Echo,
     HeadingHistory,
     RoomEstimate,
+    RoomStart,
     SilenceWatch,
     StaticSensor,
-    Vector2,
     pattern_loss,
 )
 
@@ -77,8 +76,7 @@ class RoomEkf:
         self,
         settings: RoomEkfSettings,
         sensors: Mapping[str, StaticSensor],
-        start: Vector2,
-        start_error: Vector2,
+        start: RoomStart,
     ) -> None:
         self._settings = settings
         self._sensors = dict(sensors)
@@ -90,22 +88,30 @@ class RoomEkf:
         self.discarded = 0
         size = BIASES + len(self._sensors)
         self._state = np.zeros(size)
-        self._state[:2] = start
+        self._state[:2], error = start.moments()
         self._state[GAMMA] = settings.gamma
         spread = np.full(size, settings.bias_error)
-        spread[:BIASES] = (*start_error, settings.start_speed, settings.start_speed, settings.yaw_error,
-                           settings.gamma_error)
+        spread[:BIASES] = (
+            *error,
+            settings.start_speed,
+            settings.start_speed,
+            settings.yaw_error,
+            settings.gamma_error,
+        )
         self._covariance = np.diag(spread**2)
 
     @property
     def moving(self) -> bool:
+        """Whether some sensor has seen something move not long before."""
         return self._now_ns is None or self._silence.moving(self._now_ns)
 
     def heading(self, stamp_ns: int, yaw: float) -> None:
+        """Take the direction that the person faces, rad in R0."""
         if self._settings.use_heading:
             self._headings.add(stamp_ns, yaw)
 
     def echo(self, sensor: str, echo: Echo) -> None:
+        """Take what a sensor saw."""
         self._silence.update(echo.stamp_ns, echo.valid)
         self._advance(echo.stamp_ns)
         if not echo.valid:
@@ -118,12 +124,13 @@ class RoomEkf:
             self._take_speed(self._sensors[sensor], echo)
 
     def estimate(self, stamp_ns: int) -> RoomEstimate:
+        """The state, predicted to `stamp_ns`."""
         state, covariance = self._state, self._covariance
         if self._now_ns is not None and stamp_ns > self._now_ns:
             state, covariance = self._predicted(stamp_ns, self.moving)
-        return RoomEstimate((float(state[X]), float(state[Y])), (float(state[U]), float(state[V])), covariance[:4, :4].copy())
-
-    # -- time --
+        return RoomEstimate(
+            (float(state[X]), float(state[Y])), (float(state[U]), float(state[V])), covariance[:4, :4].copy()
+        )
 
     def _advance(self, stamp_ns: int) -> None:
         if self._now_ns is None:
@@ -182,8 +189,6 @@ class RoomEkf:
         covariance[V, U] += cross
         return f @ self._state, covariance
 
-    # -- measurements --
-
     def _take_heading(self, stamp_ns: int) -> None:
         """The velocity is along the heading: what it has across is 0."""
         dt = 0.05 if self._crossed_ns is None else (stamp_ns - self._crossed_ns) * 1e-9
@@ -218,8 +223,11 @@ class RoomEkf:
         gamma = float(self._state[GAMMA])
         ratio = DECIBEL * math.log(distance / s.reference_range)
         expected = (
-            DECIBEL * math.log(sensor.k) - 4.0 * DECIBEL * math.log(distance) - pattern_loss(off)
-            + gamma * ratio + float(self._state[self._place[name]])
+            DECIBEL * math.log(sensor.k)
+            - 4.0 * DECIBEL * math.log(distance)
+            - pattern_loss(off)
+            + gamma * ratio
+            + float(self._state[self._place[name]])
         )
         slope = (gamma - 4.0) * DECIBEL / distance
         turn = -2.0 * DECIBEL * math.tan(min(max(off, -1.3), 1.3)) / distance

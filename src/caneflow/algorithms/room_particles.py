@@ -28,43 +28,15 @@ from caneflow.algorithms.room_tracking import (
     LEAST_COSINE,
     LEAST_DISTANCE,
     PATTERN_EXPONENT,
-    Area,
     Echo,
     HeadingHistory,
     RoomEstimate,
+    RoomStart,
     SilenceWatch,
     StaticSensor,
-    Vector2,
 )
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class RoomStart:
-    """Where the person may be at first: about a guess, or anywhere."""
-
-    area: Area | None = None  # m: xmin, xmax, ymin, ymax
-    guess: Vector2 | None = None  # m
-    error: float = 0.5  # m, sd of the guess
-
-    def drawn(self, count: int, random: np.random.Generator) -> Array:
-        """Positions, shape (2, count)."""
-        if self.guess is not None:
-            return np.array(self.guess)[:, None] + self.error * random.standard_normal((2, count))
-        if self.area is None:
-            raise ValueError("neither a guess of the start nor the area is known")
-        west, east, south, north = self.area
-        return np.array([[west], [south]]) + np.array([[east - west], [north - south]]) * random.random((2, count))
-
-    def moments(self) -> tuple[Vector2, Vector2]:
-        """Mean and sd, m."""
-        if self.guess is not None:
-            return self.guess, (self.error, self.error)
-        if self.area is None:
-            raise ValueError("neither a guess of the start nor the area is known")
-        west, east, south, north = self.area
-        return (0.5 * (west + east), 0.5 * (south + north)), ((east - west) / 12**0.5, (north - south) / 12**0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +161,9 @@ class _RoomParticles(ABC):
             rate = (x * u + y * v) / distance
             residual = echo.range_rate - (rate if echo.signed else np.abs(rate))
             if self._consistent(residual, s.speed_error):
-                weight += s.speed_share * normal_with_outliers(residual, s.speed_error, s.speed_outliers, 2.0 * s.fastest)
+                weight += s.speed_share * normal_with_outliers(
+                    residual, s.speed_error, s.speed_outliers, 2.0 * s.fastest
+                )
         self._particles.weigh(weight)
 
     def _consistent(self, residuals: Array, error: float) -> bool:
@@ -216,14 +190,16 @@ class ParticleTracker(_RoomParticles):
     def _move(self, stamp_ns: int, dt: float) -> None:
         s, states = self._settings, self._particles.states
         states[2:] += s.walk_noise * math.sqrt(dt) * self._random.standard_normal((2, states.shape[1]))
-        speed = np.sqrt(states[2] ** 2 + states[3] ** 2)
-        states[2:] *= np.minimum(1.0, s.fastest / np.maximum(speed, 1e-9))
+        speed = np.maximum(np.sqrt(states[2] ** 2 + states[3] ** 2), 1e-9)
+        if speed.max() > s.fastest:
+            states[2:] *= np.minimum(1.0, s.fastest / speed)
+            speed = np.minimum(speed, s.fastest)
         states[:2] += dt * states[2:]
         if self._heading_known(stamp_ns):
+            # von Mises: as a Gaussian of the angle where the angle is small, and no arctangent
             yaw = self._headings.travel(stamp_ns, stamp_ns).yaw
-            off = np.arctan2(states[3], states[2]) - yaw
-            off -= math.tau * np.round(off / math.tau)
-            self._particles.weigh(-0.5 * s.heading_share * (off / s.heading_error) ** 2)
+            along = math.cos(yaw) * states[2] + math.sin(yaw) * states[3]
+            self._particles.weigh((s.heading_share / s.heading_error**2) * (along / speed))
 
     def _hold(self, dt: float) -> None:
         self._particles.states[2:] *= math.exp(-dt / self._settings.hold_decay)
@@ -240,7 +216,7 @@ class ParticleTracker(_RoomParticles):
 
 
 class HeadingParticleTracker(_RoomParticles):
-    """States x, y, speed (m/s), and the heading of travel less the IMU's yaw (rad); without an IMU the heading itself."""
+    """States x, y, speed (m/s), and the heading of travel less the IMU's yaw (rad); without an IMU, all of it."""
 
     def _drawn(self, start: RoomStart, count: int) -> Array:
         s = self._settings

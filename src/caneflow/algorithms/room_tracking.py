@@ -46,6 +46,33 @@ class Echo:
     range: float | None = None  # m, of a sensor that measures it
 
 
+@dataclass(frozen=True, kw_only=True)
+class RoomStart:
+    """Where the person may be at first: about a guess, or anywhere."""
+
+    area: Area | None = None  # m: xmin, xmax, ymin, ymax
+    guess: Vector2 | None = None  # m
+    error: float = 0.5  # m, sd of the guess
+
+    def drawn(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+        """Positions, shape (2, count)."""
+        if self.guess is not None:
+            return np.array(self.guess)[:, None] + self.error * random.standard_normal((2, count))
+        if self.area is None:
+            raise ValueError("neither a guess of the start nor the area is known")
+        west, east, south, north = self.area
+        return np.array([[west], [south]]) + np.array([[east - west], [north - south]]) * random.random((2, count))
+
+    def moments(self) -> tuple[Vector2, Vector2]:
+        """Mean and sd, m."""
+        if self.guess is not None:
+            return self.guess, (self.error, self.error)
+        if self.area is None:
+            raise ValueError("neither a guess of the start nor the area is known")
+        west, east, south, north = self.area
+        return (0.5 * (west + east), 0.5 * (south + north)), ((east - west) / 12**0.5, (north - south) / 12**0.5)
+
+
 class RoomEstimate(NamedTuple):
     """Where the person is and how they move, R0."""
 
@@ -118,7 +145,7 @@ class HeadingHistory:
         return Travel(e1 - e0, n1 - n0, yaw1 - yaw0, yaw1)
 
     def age(self, stamp_ns: int) -> float:
-        """s since the last heading; infinite when there is none."""
+        """Seconds since the last heading; infinite when there is none."""
         return (stamp_ns - self._stamps[-1]) * 1e-9 if self._stamps else math.inf
 
     def _append(self, stamp_ns: int, yaw: float, east: float, north: float) -> None:

@@ -297,9 +297,7 @@ def _recording(
     )
 
 
-def _rig(
-    settings: RoomSettings, part: Part, place: _Installation, walk: Gait, rng: Generator
-) -> Mapping[str, object]:
+def _rig(settings: RoomSettings, part: Part, place: _Installation, walk: Gait, rng: Generator) -> Mapping[str, object]:
     """The rig as a plain map, keys as in wire.md; a course has the user's guess of the start."""
     rig: dict[str, object] = {
         "area": list(settings.area),

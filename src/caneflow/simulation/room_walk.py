@@ -129,9 +129,11 @@ def gait(way: Trajectory, who: Person, settings: PersonSettings, rng: Generator)
 
     trunk_heading = _led(way.heading, settings.trunk_lead)
     trunk_heading = trunk_heading + slow(rng, settings.trunk_wander, settings.trunk_wander_scale)(way.time)
-    ahead = surge * 0.021 * leg * ease * np.sin(2.0 * turn)
+    # a speed that swings by the part _SURGE over a step is an offset that swings by its integral
+    ahead = surge * _SURGE / (4.0 * np.pi) * stride_length * np.sin(2.0 * turn)
     aside = -sway * 0.032 * leg * ease * np.sin(turn - 0.2 * np.pi)
-    height = who.height * _HIP + bob * 0.015 * leg * relative * (np.sin(2.0 * turn - 0.7 * np.pi) - 1.0)
+    bobbing = np.sin(2.0 * turn - 0.7 * np.pi) + _HEEL_STRIKE * np.sin(4.0 * turn - 1.4 * np.pi)
+    height = who.height * _HIP + bob * 0.015 * leg * relative * (bobbing - 1.0)
     cos, sin = np.cos(way.heading), np.sin(way.heading)
     centre = np.column_stack(
         [
@@ -202,6 +204,9 @@ def seen_from(somebody: Body, sensor: Floats, settings: PersonSettings, rng: Gen
         ),
     )
 
+
+_SURGE = 0.12  # of the speed, amplitude over a step, as in walk.py; the model's 0.021 leg lengths would be twice that
+_HEEL_STRIKE = 0.12  # second harmonic of the bob: half as much again in acceleration, a soft impact (chosen)
 
 # Fractions of the height (Winter)
 _HIP, _SHOULDER, _HEAD = 0.53, 0.818, 0.936
