@@ -164,7 +164,7 @@ def test_standing_the_position_stays() -> None:
 def test_the_paper_speed_serves_where_nothing_better_comes() -> None:
     walk = loop()
     _, estimates = run(walk, speeds_only=True, delay=32)
-    assert final_error(walk, estimates) < 0.3
+    assert final_error(walk, estimates) < 0.5
 
 
 def test_the_field_where_the_walk_began_shows_the_gyros_bias() -> None:

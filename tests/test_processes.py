@@ -364,15 +364,6 @@ def test_a_missing_program_is_found_before_anything_starts(live: Path, tmp_path:
     assert "Traceback" not in done.stderr
 
 
-def test_live_drivers_say_that_they_are_not_there_yet(cane: Path) -> None:
-    text = cane.read_text() + "rig: {hand_height: 0.95, aperture: 0.87, pivot: [0, -0.3, 0]}\n"
-    cane.write_text(text.replace("run: drivers.bno055", "run: drivers.bno055, restart: never"))
-    done = caneflow("run", cane)
-    assert done.returncode == 1
-    assert "--replay" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def test_a_recording_cut_short_is_replayed_up_to_the_cut(cane: Path, walk: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(walk.read_bytes()[: walk.stat().st_size * 2 // 3])

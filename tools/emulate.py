@@ -2,7 +2,6 @@
 
 import math
 import os
-import random
 import select
 import signal
 import socket
@@ -91,7 +90,7 @@ def bno055(
     chip = bno055_emulator.Emulator(
         motion,
         faults,
-        random.Random(seed),  # noqa: S311 - faults are no secret
+        np.random.default_rng(seed),
         now=now,
         begin=None if begin is None else now + begin - time.time(),
     )

@@ -38,10 +38,10 @@ class CaneFilterSettings:
     velocity_inflation: Annotated[float, Gt(0)] = 6.0
     speed_noise: Annotated[float, Gt(0)] = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
     speed_patience: Annotated[float, Gt(0)] = 0.5  # s without a velocity before the paper's speed is taken instead
-    sideways: Annotated[float, Gt(0)] = 0.15  # m/s, sd of the hand's velocity across the way the cane points (cane.md)
+    sideways: Annotated[float, Gt(0)] = 0.1  # m/s, sd of the hand's velocity across the way the cane points
     sideways_interval: Annotated[float, Gt(0)] = 0.1  # s
     sideways_memory: Annotated[float, Gt(0)] = 1.0  # s over which swinging and turning are noticed
-    sideways_per_turn: Annotated[float, Ge(0)] = 0.4  # m: (m/s) of doubt per (rad/s) of swinging or turning
+    sideways_per_turn: Annotated[float, Ge(0)] = 0.3  # m: (m/s) of doubt per (rad/s) of swinging or turning
     hand_ahead: float = 0.3  # m that the hand is carried ahead of the body: it goes sideways when the body turns
     standing_speed: Annotated[float, Gt(0)] = 0.03  # m/s, sd of the sensors' while the bearer stands
     standing_inflation: Annotated[float, Gt(0)] = 20.0  # samples that share one drift of the hand

@@ -17,7 +17,10 @@ from scipy import fft
 
 INT16_FULL_SCALE = 32768.0
 SMOOTHING = 0.95  # per hop, of the spectrum whose minimum is taken: 1 s at the hop of 50 ms
-FLOOR_BIAS = 0.57  # that minimum over 20 s of white noise, relative to its mean; a test simulates it
+FLOOR_BIAS = 0.565  # that minimum over 20 s of white noise, relative to its mean; a test simulates it
+QUARTILE = 0.288  # lower quartile of one spectrum of white noise, relative to its mean: ln(4/3)
+SETTLING = 20  # spectra before the first minimum is taken
+PARTS = 8  # of the memory; the oldest is forgotten as a whole
 LEAST_POWER = 1e-16  # of full scale: far below the last bit of any converter
 
 
@@ -83,10 +86,9 @@ class SlidingSpectrum:
         self._forget_over_gap(stamp_ns, len(samples))
         self._last_ns = stamp_ns
         self._take(samples)
-        if self._since_hop < self._hop or self._filled < len(self._kept):
-            return None
+        due = self._since_hop >= self._hop
         self._since_hop %= self._hop
-        return self._spectrum()
+        return self._spectrum() if due and self._filled == len(self._kept) else None
 
     def _prepare(self, sample_rate: float, carrier: float, signed: bool) -> None:
         settings = self._settings
@@ -97,7 +99,7 @@ class SlidingSpectrum:
         self._kept = np.zeros(count, dtype=np.complex128 if signed else np.float64)
         self._filled = 0
         self._hop = max(round(settings.hop * sample_rate), 1)
-        self._since_hop = self._hop
+        self._since_hop = 0
         self._hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(count) / count)
         self._length = fft.next_fast_len(round(settings.padding * count), real=not signed)
         frequencies = fft.fftfreq(self._length, 1.0 / sample_rate)
@@ -122,8 +124,7 @@ class SlidingSpectrum:
         elapsed = (stamp_ns - self._last_ns) * 1e-9 * sample_rate  # samples
         if elapsed > 1.5 * count + 1.0:
             self.gaps += 1
-            self._filled = 0
-            self._since_hop = self._hop
+            self._filled = self._since_hop = 0
 
     def _take(self, samples: NDArray[np.number]) -> None:
         scaled = samples / INT16_FULL_SCALE if samples.dtype.kind == "i" else samples
@@ -152,25 +153,36 @@ class SlidingSpectrum:
 
 
 class NoiseFloor:
-    """Per bin the minimum of the smoothed power over the last `memory` spectra, in eight parts."""
+    """Per bin the minimum of the smoothed power over the last `memory` spectra.
 
-    PARTS = 8
+    Until there has been time for a minimum, a line that stands would be taken for noise; so at first no bin's floor
+    is above what the quieter bins have.
+    """
 
     def __init__(self, memory: int) -> None:
-        self._part = max(memory // self.PARTS, 1)  # spectra per part
-        self._minima: deque[NDArray[np.float64]] = deque(maxlen=self.PARTS)
+        self._part = max(memory // PARTS, SETTLING)  # spectra per part
+        self._minima: deque[NDArray[np.float64]] = deque(maxlen=PARTS)
         self._smooth: NDArray[np.float64] | None = None
         self._count = 0
 
     def update(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
         """The floor, shape (B,), after one more spectrum of shape (B,)."""
+        self._count += 1
         if self._smooth is None:
             self._smooth = power.copy()
-        self._smooth += (1.0 - SMOOTHING) * (power - self._smooth)
-        if self._count % self._part == 0:
+        else:  # at first the plain mean: a single spectrum has zeros
+            self._smooth += max(1.0 - SMOOTHING, 1.0 / self._count) * (power - self._smooth)
+        if self._count <= SETTLING:
+            return self._raised(np.full_like(power, np.quantile(power, 0.25) / QUARTILE))
+        if (self._count - SETTLING - 1) % self._part == 0:
             self._minima.append(self._smooth.copy())
         else:
             np.minimum(self._minima[-1], self._smooth, out=self._minima[-1])
-        self._count += 1
-        lowest = np.asarray(np.min(self._minima, axis=0), dtype=np.float64)
-        return np.maximum(lowest / FLOOR_BIAS, LEAST_POWER)
+        floor = np.asarray(np.min(self._minima, axis=0), dtype=np.float64) / FLOOR_BIAS
+        if self._count <= self._part:
+            np.minimum(floor, np.quantile(floor, 0.25), out=floor)
+        return self._raised(floor)
+
+    @staticmethod
+    def _raised(floor: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.maximum(floor, LEAST_POWER)

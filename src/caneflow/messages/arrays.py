@@ -64,4 +64,4 @@ def from_bytes(data: memoryview) -> Array:
     expected = math.prod(shape) * dtype.itemsize
     if len(data) - offset != expected:
         raise MessageError(f"array of shape {shape} and dtype {dtype} has {len(data) - offset} bytes, not {expected}")
-    return np.frombuffer(data, dtype, offset=offset).reshape(shape)
+    return np.ndarray(shape, dtype, data, offset)

@@ -1,5 +1,6 @@
 """The rig: what is bolted on, as opposed to what flows. One map, for every node and in every recording."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -67,7 +68,7 @@ class Rig(BaseModel):
         return value
 
 
-def read_rig(values: dict[str, Any]) -> Rig:
+def read_rig(values: Mapping[str, object]) -> Rig:
     """The rig in a map that a recording or a plan holds; raises MessageError, naming every value that is not right.
 
     Keys that this version does not know are left out: a later one may have recorded them.

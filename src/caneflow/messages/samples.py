@@ -4,7 +4,7 @@ A sample checks itself when it is made, so a bad one is refused on the way in an
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Annotated, ClassVar, TypeAlias
 
 import msgspec
@@ -52,9 +52,12 @@ class Imu(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
 
     def __post_init__(self) -> None:
         require_finite("gyro", self.gyro)
-        for name, value in (("accel", self.accel), ("mag", self.mag), ("linear_accel", self.linear_accel)):
-            if value is not None:
-                require_finite(name, value)
+        if self.accel is not None:
+            require_finite("accel", self.accel)
+        if self.mag is not None:
+            require_finite("mag", self.mag)
+        if self.linear_accel is not None:
+            require_finite("linear_accel", self.linear_accel)
         if self.orientation is not None:
             require_unit("orientation", self.orientation)
         if self.calibration is not None and max(self.calibration) > 3:
@@ -78,10 +81,9 @@ class RadarFrame(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False
 
     def __post_init__(self) -> None:
         require_array("scans", self.scans, "hifF", dimensions=2)
-        require_finite("range_start", (self.range_start,))
         require_finite(
-            "period, step, carrier, bandwidth",
-            (self.scan_period, self.range_step, self.carrier, self.bandwidth),
+            "range_start, scan_period, range_step, carrier, bandwidth",
+            (self.range_start, self.scan_period, self.range_step, self.carrier, self.bandwidth),
         )
 
 
@@ -106,10 +108,9 @@ class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fals
     velocity_delay: Annotated[float | None, Meta(description="s by which velocity lags the stamp")] = None
 
     def __post_init__(self) -> None:
-        require_finite("speed", (self.speed,))
+        require_finite("speed, delay, velocity_delay", (self.speed, self.delay or 0.0, self.velocity_delay or 0.0))
         if not self.quality >= 0:  # also refuses NaN; +inf is allowed
             raise ValueError(f"quality is {self.quality}; it is 0 or more, or +inf")
-        require_finite("delay", (self.delay or 0.0, self.velocity_delay or 0.0))
         if self.velocity is not None:
             require_finite("velocity", self.velocity)
         if self.velocity_cov is not None:
@@ -177,9 +178,10 @@ SAMPLES: dict[str, type[Sample]] = {
 }
 
 
-def require_finite(name: str, values: Iterable[float]) -> None:
+def require_finite(name: str, values: Sequence[float]) -> None:
     """Raise ValueError unless every value is a finite number."""
-    if not all(map(math.isfinite, values)):
+    # One that is not leaves no sum finite; a sum may be infinite without any.
+    if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
         raise ValueError(f"{name} is {values}; NaN and infinity are not allowed")
 
 

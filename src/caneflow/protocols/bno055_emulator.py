@@ -5,11 +5,12 @@ said where it is assumed. The motion is what the chip said when it was recorded,
 profile are registers that can be written and read, and change nothing.
 """
 
-import random
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+
+from numpy.random import Generator
 
 from caneflow.protocols import bno055
 from caneflow.protocols.bno055 import MODE_BITS, PROFILE_BYTES, Mode, Register
@@ -90,7 +91,7 @@ class Emulator:
         self,
         motion: Motion,
         faults: Faults,
-        rng: random.Random,
+        rng: Generator,
         *,
         now: float,
         begin: float | None = None,
@@ -300,6 +301,52 @@ class Emulator:
             return None
         time = now - self.begin
         return next((start for start, lasts in spans if start <= time < start + lasts), None)
+
+
+class Bench:
+    """A serial port with an emulated chip behind it, on a clock that goes on only when somebody waits.
+
+    A BytePort: 60 s at 100 Hz pass as fast as they are computed, and the same way every time.
+    """
+
+    def __init__(self, emulator: Emulator, *, time: float = 0.0, timeout: float = 0.03) -> None:
+        self.emulator = emulator
+        self.time = time  # s
+        self.timeout = timeout  # s, of `read`
+        self._come = bytearray()
+
+    def pause(self, seconds: float) -> None:
+        """Let time pass."""
+        self.time += max(seconds, 0.0)
+
+    def now_ns(self) -> int:
+        """The time, ns."""
+        return round(self.time * 1e9)
+
+    def write(self, data: bytes, /) -> None:
+        """Hand over all of `data`."""
+        self.emulator.receive(data, self.time)
+
+    def read(self, size: int = 1, /) -> bytes:
+        """Up to `size` bytes; fewer when the timeout has passed."""
+        end = self.time + self.timeout
+        while True:
+            self._come += self.emulator.send(self.time)
+            due = self.emulator.next_time()
+            if len(self._come) >= size:
+                break
+            if due is None or due > end:
+                self.time = end
+                break
+            self.time = max(self.time, due)
+        data = bytes(self._come[:size])
+        del self._come[:size]
+        return data
+
+    def reset_input_buffer(self) -> None:
+        """Forget what has come and was not read."""
+        self.emulator.send(self.time)
+        self._come.clear()
 
 
 def _fault(kind: int, register: int, length: int) -> int | None:

@@ -19,6 +19,7 @@ from zstandard import ZstdError
 MAGIC = MCAP0_MAGIC  # at the start and at the end of the file
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
+MESSAGE_START = struct.Struct("<BQHIQQ")  # a message's record up to its payload
 FOOTER_LENGTH = RECORD.size + 20 + len(MAGIC)
 CHECKED_FOOTER = RECORD.size + 16  # bytes of the footer that its check sum covers
 MESSAGE = int(Opcode.MESSAGE)  # comparing with the enum's member takes as long as unpacking a message
@@ -85,21 +86,27 @@ class Content:
         """Find the messages in `data`; what it declares on the way is added to `declared`."""
         self.data = data
         self.messages: defaultdict[str, list[Entry]] = defaultdict(list)
-        at = 0
-        while at < len(data):
-            opcode, length = RECORD.unpack_from(data, at)
+        of_channel: dict[int, list[Entry]] = {}
+        at, end = 0, len(data)
+        while at < end:
             body = at + RECORD.size
-            at = body + length
-            if at > len(data):
-                raise ValueError(f"a record reaches {at - len(data)} bytes beyond its block")
-            if opcode == MESSAGE:
-                if length < MESSAGE_HEAD.size:
-                    raise ValueError(f"a message of {length} bytes; its head alone has {MESSAGE_HEAD.size}")
-                number, seq, log_time, stamp = MESSAGE_HEAD.unpack_from(data, body)
-                topic = declared.channels[number].topic
-                self.messages[topic].append((stamp, seq, log_time, body + MESSAGE_HEAD.size, at))
+            if at + MESSAGE_START.size <= end:  # in one go, as nearly all are messages
+                opcode, length, number, seq, log_time, stamp = MESSAGE_START.unpack_from(data, at)
             else:
+                opcode, length = RECORD.unpack_from(data, at)
+            at = body + length
+            if at > end:
+                raise ValueError(f"a record reaches {at - end} bytes beyond its block")
+            if opcode != MESSAGE:
                 declared.note(opcode, data[body:at])
+                of_channel.clear()
+                continue
+            if length < MESSAGE_HEAD.size:
+                raise ValueError(f"a message of {length} bytes; its head alone has {MESSAGE_HEAD.size}")
+            entries = of_channel.get(number)
+            if entries is None:
+                entries = of_channel[number] = self.messages[declared.channels[number].topic]
+            entries.append((stamp, seq, log_time, body + MESSAGE_HEAD.size, at))
 
 
 def layout_of(file: BinaryIO) -> Layout:

@@ -2,6 +2,7 @@
 
 import heapq
 import json
+import os
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ from caneflow.recording.layout import DAMAGE, MAGIC, Block, Content, Layout, con
 
 TRUTH = ("truth", "pose")  # node and port of the ground truth, where there is any
 EXPECTED = "a recording is an MCAP file as `caneflow run --record` writes it"
+
+# Blocks by file and offset, while somebody reads them: a host in one process has a reader per source of the graph.
+_contents: WeakValueDictionary[tuple[tuple[int, ...], int], Content] = WeakValueDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +80,8 @@ class Recording:
             raise RecordingError(f"{self.path}: cannot be read: {error.strerror or error}") from error
         try:
             self._layout = _sound_layout(self.path, self._file)
-            self._contents: WeakValueDictionary[int, Content] = WeakValueDictionary()  # by offset of the block
+            about = os.fstat(self._file.fileno())
+            self._file_id = (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)
             self._lasts: dict[tuple[int, str], int] = {}  # by offset and key: the last stamp, ns
             self.complete = self._layout.complete
             self.metadata, self.rig = _about(self.path, self._layout)
@@ -111,7 +116,9 @@ class Recording:
         wanted = [self.stream(*name) for name in (self.streams if streams is None else streams)]
         for stream in wanted:
             self._require_samples(stream)
-        each = (self._samples_of(stream, start_ns, end_ns) for stream in wanted)
+        each = [self._samples_of(stream, start_ns, end_ns) for stream in wanted]
+        if len(each) == 1:
+            return each[0]
         return heapq.merge(*each, key=attrgetter("stamp"))  # equal stamps: in the order of the arguments
 
     def said(self, key: str) -> Iterator[bytes]:
@@ -164,14 +171,15 @@ class Recording:
         return [block for block in self._layout.blocks if key in block.topics]
 
     def _content(self, block: Block) -> Content:
-        """The messages of `block`, unpacked once for all streams that are in it at a time."""
-        content = self._contents.get(block.offset)
+        """The messages of `block`, unpacked once for all that are in it at a time."""
+        at = self._file_id, block.offset
+        content = _contents.get(at)
         if content is None:
             try:
                 content = content_of(self._file, block, self._layout.declared)
             except DAMAGE as error:
                 raise RecordingError(_damaged(self.path, block.offset)) from error
-            self._contents[block.offset] = content
+            _contents[at] = content
         return content
 
     def _streams(self) -> tuple[dict[tuple[str, str], Stream], dict[str, int]]:

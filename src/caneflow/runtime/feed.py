@@ -36,7 +36,8 @@ class Feed:
 
     def nothing_until(self, stamp: int) -> None:
         """Note that no further sample with a stamp at or before `stamp` (ns) will be brought."""
-        self._quiet = max(self._quiet, stamp)
+        if stamp > self._quiet:
+            self._quiet = stamp
 
     def progress(self) -> Progress:
         """How far each stream has come."""

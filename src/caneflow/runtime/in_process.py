@@ -4,9 +4,11 @@ For evaluation, tuning, debugging and fleets of recordings; and the oracle for t
 give the same bytes.
 """
 
+import heapq
 import importlib
 from collections.abc import Iterator, Mapping
 from itertools import islice
+from typing import TypeAlias
 
 from caneflow.messages import MessageError, Sample, decode, encode, with_number
 from caneflow.messages.control import Counters
@@ -19,6 +21,8 @@ from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.stage import Stage
 from caneflow.runtime.tap import Tap
+
+Arriving: TypeAlias = tuple[str, str, Sample | Encoded]  # node, port, sample
 
 BATCH = 256  # samples of the sources that are spread before the operators run: bounds the memory
 OWN_PROGRAMS = {REPLAYER_MODULE: "Replay", RECORDER_MODULE: "Recorder"}  # what a deployment adds to the graph
@@ -38,7 +42,9 @@ class InProcess:
             plan = deployment.plans[name]
             self._add(plan, build(_program(plan, programs), plan))
         # (node, port) -> who reads it on which port
-        self._wires: dict[tuple[str, str], list[tuple[Stage | Tap, str]]] = {}
+        self._wires: dict[tuple[str, str], list[tuple[Stage | Tap, str]]] = {
+            (name, port): [] for name, plan in deployment.plans.items() for port in plan.outputs
+        }
         for name, reader in self._readers.items():
             for port, wire in deployment.plans[name].inputs.items():
                 self._wires.setdefault((wire.writer, wire.key.rpartition("/")[2]), []).append((reader, port))
@@ -72,41 +78,34 @@ class InProcess:
             feed.ended = True
         self._run_readers()
 
-    def _merged(self) -> Iterator[tuple[str, str, Sample | Encoded]]:
-        """The samples of all sources in the order of their stamps, as (node, port, sample)."""
-        iterators = {name: _samples(source) for name, (_, source) in self._feeds.items()}
-        heads = {name: item for name, iterator in iterators.items() if (item := next(iterator, None))}
-        while heads:
-            name = min(heads, key=lambda name: heads[name][1].stamp)
-            yield name, *heads[name]
-            item = next(iterators[name], None)
-            if item is None:
-                del heads[name]
-            else:
-                heads[name] = item
+    def _merged(self) -> Iterator[Arriving]:
+        """The samples of all sources in the order of their stamps."""
+        each = [_samples(name, source) for name, (_, source) in self._feeds.items()]
+        return heapq.merge(*each, key=_stamp)  # equal stamps: in the order of the nodes
 
     def _bring(self, name: str, port: str, sample: Sample | Encoded) -> None:
+        """Let a source's sample reach all its readers, decoded once."""
         feed, _ = self._feeds[name]
         payload = feed.take(port, sample)
-        if payload is not None:
-            self._spread(name, port, payload)
+        readers = self._wires[name, port]
+        if payload is None or not readers:
+            return
+        try:
+            message = decode(payload, feed.outputs[port].plan.kind)
+        except MessageError as error:
+            for reader, at in readers:
+                reader.refuse(at, error)
+        else:
+            self._spread(name, port, message, payload)
 
-    def _spread(self, name: str, port: str, payload: bytes, message: Sample | None = None) -> None:
-        """Hand one sample to all its readers, decoded once."""
-        readers = self._wires.get((name, port), ())
-        for reader, at in readers:
-            if message is None:
-                try:
-                    message = decode(payload, self._deployment.plans[name].outputs[port].kind)
-                except MessageError as error:
-                    for refusing, its in readers:
-                        refusing.refuse(its, error)
-                    return
-            if isinstance(reader, Tap):
+    def _spread(self, name: str, port: str, message: Sample, payload: bytes | None = None) -> None:
+        """Hand one sample to all its readers; `payload` are its bytes, where there are any yet."""
+        for reader, at in self._wires[name, port]:
+            if isinstance(reader, Stage):
+                reader.offer(at, message)
+            else:
                 # There is no reception here; the stamp stands for it, so that a run gives the same file again.
                 reader.offer(at, message, payload or encode(message), message.stamp)
-            else:
-                reader.offer(at, message)
 
     def _run_readers(self) -> None:
         """Let every node handle what is due; writers come first, so one round is enough."""
@@ -119,12 +118,12 @@ class InProcess:
                 continue
             while (emitted := reader.step()) is not None:
                 for port, message, seq in emitted:
-                    self._spread(name, port, b"", with_number(message, seq))
+                    self._spread(name, port, with_number(message, seq))
             self._pass_marks(name, reader)
 
     def _pass_marks(self, name: str, writer: Feed | Stage) -> None:
         for port, mark in writer.progress().ports.items():
-            for reader, at in self._wires.get((name, port), ()):
+            for reader, at in self._wires[name, port]:
                 reader.mark(at, mark)
 
     def _add(self, plan: NodePlan, built: Operator | Source | Sink) -> None:
@@ -146,8 +145,12 @@ class InProcess:
         return counters
 
 
-def _samples(source: Source) -> Iterator[tuple[str, Sample | Encoded]]:
-    return (item for item in source.samples() if not isinstance(item, Quiet))
+def _samples(name: str, source: Source) -> Iterator[Arriving]:
+    return ((name, *item) for item in source.samples() if not isinstance(item, Quiet))
+
+
+def _stamp(arriving: Arriving) -> int:
+    return arriving[2].stamp
 
 
 def _program(plan: NodePlan, programs: Mapping[str, Program]) -> Program:

@@ -31,7 +31,8 @@ class Merge:
     def advance(self, port: str, watermark: int) -> None:
         """Note that no sample with a stamp <= `watermark` (ns) will come on `port`."""
         i = self._index[port]
-        self._watermarks[i] = max(self._watermarks[i], watermark)
+        if watermark > self._watermarks[i]:
+            self._watermarks[i] = watermark
 
     def watermark(self, port: str) -> int:
         """Up to which stamp (ns) everything of `port` has come."""
@@ -47,15 +48,14 @@ class Merge:
 
     def pop(self) -> tuple[str, Sample] | None:
         """The next sample in event time, or None while another stream may still come before it."""
-        first = self._first()
-        if first is None or self._holding(first) is not None:
+        first, holding = self._next()
+        if first is None or holding is not None:
             return None
         return self.ports[first], self._queues[first].popleft()
 
     def held_by(self) -> str | None:
         """The port that the next sample waits for, if one waits at all."""
-        first = self._first()
-        holding = None if first is None else self._holding(first)
+        _, holding = self._next()
         return None if holding is None else self.ports[holding]
 
     def handled(self) -> int:
@@ -64,22 +64,15 @@ class Merge:
             (queue[0].stamp - 1 if queue else mark) for queue, mark in zip(self._queues, self._watermarks, strict=True)
         )
 
-    def _first(self) -> int | None:
-        """The index of the port whose oldest sample is next by (stamp, port order)."""
-        first = None
+    def _next(self) -> tuple[int | None, int | None]:
+        """The port whose oldest sample is next by (stamp, port order), and one that may still bring one before it."""
+        first, stamp = None, END
         for i, queue in enumerate(self._queues):
-            if queue and (first is None or queue[0].stamp < self._queues[first][0].stamp):
-                first = i
-        return first
-
-    def _holding(self, first: int) -> int | None:
-        """The index of a port that may still bring a sample before the first one of port `first`."""
-        for i, queue in enumerate(self._queues):
-            if not queue and self._watermarks[i] < self._needed(first, i):
-                return i
-        return None
-
-    def _needed(self, first: int, other: int) -> int:
-        """The watermark that port `other` must have passed before the first sample of port `first` may go."""
-        stamp = self._queues[first][0].stamp
-        return stamp if other < first else stamp - 1
+            if queue and (first is None or queue[0].stamp < stamp):
+                first, stamp = i, queue[0].stamp
+        if first is not None:
+            for i, queue in enumerate(self._queues):
+                # At the same stamp the earlier port goes first: only such a one must have passed it.
+                if not queue and self._watermarks[i] < (stamp if i < first else stamp - 1):
+                    return first, i
+        return first, None

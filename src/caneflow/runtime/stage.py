@@ -4,7 +4,7 @@ Samples come in as they arrive and are checked against their stream; the operato
 emits is numbered. Nothing here knows Zenoh, processes or a clock.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import msgspec
 
@@ -13,7 +13,7 @@ from caneflow.messages.control import InputCounts, LeftOut, PortMark, Progress
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.merge import END, Merge
 from caneflow.runtime.plan import InputPlan, OutputPlan
-from caneflow.runtime.program import Emitted, Operator, Refused
+from caneflow.runtime.program import Operator, Refused
 from caneflow.runtime.streams import Arrivals, Departures
 
 
@@ -75,7 +75,7 @@ class Stage:
         """The port that the next sample waits for."""
         return self._merge.held_by()
 
-    def step(self, now: int | None = None) -> Iterator[tuple[str, Sample, int]] | None:
+    def step(self, now: int | None = None) -> list[tuple[str, Sample, int]] | None:
         """Handle the next sample in event time: what follows, as (port, message, seq). None: nothing is due.
 
         `now` (ns) is the host's clock, given by a live host only: inputs may have a greatest age.
@@ -88,12 +88,11 @@ class Stage:
             if now is not None and arrivals.too_old(message, now):
                 arrivals.counts.dropped += 1
                 arrivals.leave_out(message, "dropped")
-                return iter(())
-            arrivals.counts.handled += 1
-            return self._numbered(self._handled(port, message))
+                return []
+            return self._handled(port, message)
         if not self.finished and self._merge.handled() == END:
             self.finished = True
-            return self._numbered(self._operator.finish())
+            return [self._numbered(port, message) for port, message in self._operator.finish()]
         return None
 
     def progress(self) -> Progress:
@@ -153,21 +152,22 @@ class Stage:
             self._merge.push(port, message)
             self._keep_length(port, arrivals)
 
-    def _handled(self, port: str, message: Sample) -> Emitted:
+    def _handled(self, port: str, message: Sample) -> list[tuple[str, Sample, int]]:
+        emitted = []
         try:
-            yield from self._operator.handle(port, message)
+            for out, follows in self._operator.handle(port, message):
+                emitted.append(self._numbered(out, follows))
         except Refused as refused:
-            self.inputs[port].counts.handled -= 1
             self.inputs[port].refuse(refused)
+        else:
+            self.inputs[port].counts.handled += 1
+        return emitted
 
-    def _numbered(self, emitted: Emitted) -> Iterator[tuple[str, Sample, int]]:
-        for port, message in emitted:
-            departures = self.outputs.get(port)
-            if departures is None:
-                raise DataflowError(
-                    f"{self.node}: emitted on port {port!r}; it has {', '.join(self.outputs) or 'none'}"
-                )
-            yield port, message, departures.number(message)
+    def _numbered(self, port: str, message: Sample) -> tuple[str, Sample, int]:
+        departures = self.outputs.get(port)
+        if departures is None:
+            raise DataflowError(f"{self.node}: emitted on port {port!r}; it has {', '.join(self.outputs) or 'none'}")
+        return port, message, departures.number(message)
 
     def _keep_length(self, port: str, arrivals: Arrivals) -> None:
         length = arrivals.plan.length
@@ -176,6 +176,5 @@ class Stage:
             arrivals.counts.dropped += 1
 
     def _count_mark(self, port: str, arrivals: Arrivals) -> None:
-        watermark = arrivals.arrived_mark()
-        if watermark is not None:
+        if arrivals.mark is not None and (watermark := arrivals.arrived_mark()) is not None:
             self._merge.advance(port, watermark)

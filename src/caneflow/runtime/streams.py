@@ -53,6 +53,9 @@ class Arrivals:
         `again`: it was asked for, so it is no fault if it has come before.
         """
         self.counts.received += 1
+        if message.seq == self.expected and message.stamp > self.last_stamp and not (self.ahead or self.unreadable):
+            self.expected, self.last_stamp = message.seq + 1, message.stamp  # as it should be, and nearly always is
+            return [message]
         if message.stamp <= self.last_stamp or message.seq in self.ahead:
             self._refuse_old(message, again=again)
             return []

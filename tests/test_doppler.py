@@ -1,0 +1,221 @@
+"""The Doppler front end: lines of known frequency and amplitude, the noise floor, gaps, cost, and real recordings."""
+
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.io import wavfile
+
+from caneflow.algorithms.doppler_line import (
+    SPEED_OF_LIGHT,
+    DopplerLine,
+    DopplerLineSettings,
+    predominant_line,
+    range_from_strength,
+)
+from caneflow.algorithms.doppler_spectrum import (
+    FLOOR_BIAS,
+    DopplerSpectrum,
+    DopplerSpectrumSettings,
+    NoiseFloor,
+    SlidingSpectrum,
+)
+
+CW24 = Path(__file__).parents[1].parent / "shared" / "data" / "cw24-walk"
+RATE = 4000.0  # Hz
+CARRIER = 24.125e9  # Hz
+BLOCK = 200  # samples, 50 ms
+START_NS = 1_700_000_000_000_000_000
+BLOCK_NS = 50_000_000
+
+
+def spectra(
+    samples: np.ndarray, rate: float = RATE, chosen: DopplerSpectrumSettings | None = None
+) -> list[DopplerSpectrum]:
+    """Of samples cut into blocks of 50 ms."""
+    window = SlidingSpectrum(chosen or DopplerSpectrumSettings())
+    size = round(0.05 * rate)
+    found = []
+    for index in range(len(samples) // size):
+        block = samples[index * size : (index + 1) * size]
+        one = window.update(START_NS + (index + 1) * BLOCK_NS, block, rate, CARRIER)
+        if one is not None:
+            found.append(one)
+    return found
+
+
+def tone(frequency: float, amplitude: float, seconds: float = 1.0, noise: float = 1e-4) -> np.ndarray:
+    """An I/Q line in a little noise."""
+    at = np.arange(round(seconds * RATE)) / RATE
+    random = np.random.default_rng(5)
+    noises = noise * (random.standard_normal(len(at)) + 1j * random.standard_normal(len(at)))
+    return np.asarray(amplitude * np.exp(2j * np.pi * frequency * at) + noises, dtype=np.complex64)
+
+
+def line_of(samples: np.ndarray) -> DopplerLine:
+    return predominant_line(spectra(samples)[-1], DopplerLineSettings())
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    speed=st.floats(0.15, 3.3),
+    approaching=st.booleans(),
+    decibels=st.floats(-50.0, 0.0),
+)
+def test_a_line_has_its_speed_its_sign_and_its_amplitude(speed: float, approaching: bool, decibels: float) -> None:
+    """24.125 GHz: 160.9 Hz per m/s; positive frequency approaches, so the range shrinks."""
+    amplitude = 10.0 ** (decibels / 20.0)
+    frequency = (1.0 if approaching else -1.0) * 2.0 * CARRIER * speed / SPEED_OF_LIGHT
+    line = line_of(tone(frequency, amplitude))
+    assert line.valid
+    assert line.range_rate == pytest.approx(-speed if approaching else speed, abs=0.003)
+    assert 20.0 * math.log10(line.amplitude / amplitude) == pytest.approx(0.0, abs=0.1)
+
+
+def test_one_mixer_sees_the_same_strength_and_no_sign() -> None:
+    samples = tone(-200.0, 0.05).real
+    line = line_of(np.round(samples * 32768.0).astype(np.int16))
+    assert line.amplitude == pytest.approx(0.05, rel=0.02)
+    assert line.range_rate == pytest.approx(200.0 / 160.93, rel=0.01)
+
+
+def test_the_image_of_an_unbalanced_module_is_not_taken_for_the_line() -> None:
+    samples = tone(200.0, 0.05)
+    assert line_of(samples + 0.2 * np.conj(samples)).range_rate < 0.0
+
+
+def test_the_floor_of_white_noise_is_its_mean() -> None:
+    """The bias of the minimum, simulated: within 1 dB over the band, once its memory is filled."""
+    random = np.random.default_rng(1)
+    found = spectra(random.standard_normal(round(60 * RATE)).astype(np.float32) * 0.01)
+    mean = np.mean([one.power for one in found])
+    assert 10.0 * math.log10(np.mean(found[-1].floor) / mean) == pytest.approx(0.0, abs=1.0)
+
+
+def test_the_floor_forgets_in_its_time_and_not_before() -> None:
+    floor = NoiseFloor(memory=400)
+    quiet, loud = np.full(3, 1.0), np.full(3, 100.0)
+    for _ in range(100):
+        floor.update(quiet)
+    after = [float(floor.update(loud)[0]) * FLOOR_BIAS for _ in range(500)]
+    assert after[340] == pytest.approx(1.0, rel=0.01)
+    assert after[-1] > 90.0
+
+
+def test_lamp_hum_is_part_of_the_floor() -> None:
+    """A line that never goes away is no person, though it is the strongest."""
+    random = np.random.default_rng(2)
+    at = np.arange(round(30 * RATE)) / RATE
+    hum = 0.02 * np.cos(2 * np.pi * 100.0 * at)
+    walker = np.where(at > 20.0, 0.005 * np.cos(2 * np.pi * 190.0 * at), 0.0)
+    samples = (hum + walker + 1e-4 * random.standard_normal(len(at))).astype(np.float32)
+    line = predominant_line(spectra(samples)[-1], DopplerLineSettings(least_share=0.0))
+    assert line.range_rate == pytest.approx(190.0 / 160.93, rel=0.02)
+
+
+def test_noise_alone_is_hardly_ever_a_person() -> None:
+    random = np.random.default_rng(3)
+    found = spectra((0.01 * random.standard_normal(round(60 * RATE))).astype(np.float32))
+    lines = [predominant_line(one, DopplerLineSettings()) for one in found]
+    assert np.mean([line.valid for line in lines]) < 0.05
+
+
+def test_an_even_spread_of_energy_is_no_line() -> None:
+    """Ten lines of one strength: each is far over the floor, none is a quarter of the energy."""
+    lines = [tone(60.0 + 50.0 * index, 0.02, noise=1e-5) for index in range(10)]
+    line = line_of(np.asarray(np.sum(lines, axis=0), dtype=np.complex64))
+    assert line.snr > 10.0
+    assert not line.valid
+
+
+def test_samples_that_are_missing_start_the_window_anew() -> None:
+    window = SlidingSpectrum(DopplerSpectrumSettings())
+    samples = tone(200.0, 0.1)
+    given = 0
+    stamps = [START_NS + index * BLOCK_NS for index in range(20)]
+    for index, stamp in enumerate(stamps):
+        if index in (10, 11):
+            continue
+        block = samples[index * BLOCK : (index + 1) * BLOCK]
+        given += window.update(stamp, block, RATE, CARRIER) is not None
+    # 256 ms take 6 blocks; before the gap 10 blocks came, after it 8
+    assert window.gaps == 1
+    assert given == (10 - 5) + (8 - 5)
+
+
+def test_the_length_of_the_blocks_does_not_matter() -> None:
+    samples = tone(-150.0, 0.1)
+    whole = spectra(samples)[-1]
+    window = SlidingSpectrum(DopplerSpectrumSettings())
+    found = []
+    for index in range(len(samples) // 40):
+        stamp = START_NS + (index + 1) * 10_000_000
+        found.append(window.update(stamp, samples[index * 40 : (index + 1) * 40], RATE, CARRIER))
+    given = [one for one in found if one is not None]
+    assert len(given) == len(spectra(samples))
+    np.testing.assert_allclose(given[-1].power, whole.power, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("chosen", [{"lowest": 600.0}, {"highest": 3000.0}])
+def test_a_band_that_cannot_be_is_refused(chosen: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="band"):
+        spectra(tone(200.0, 0.1), chosen=DopplerSpectrumSettings(**chosen))
+
+
+def test_time_must_go_on() -> None:
+    window = SlidingSpectrum(DopplerSpectrumSettings())
+    window.update(START_NS, tone(200.0, 0.1)[:BLOCK], RATE, CARRIER)
+    with pytest.raises(ValueError, match="not newer"):
+        window.update(START_NS, tone(200.0, 0.1)[:BLOCK], RATE, CARRIER)
+
+
+def test_range_is_the_fourth_root() -> None:
+    """Twelve decibels less are twice as far."""
+    near, far = range_from_strength(0.1, 1.0), range_from_strength(0.025, 1.0)
+    assert far / near == pytest.approx(2.0)
+    assert near == pytest.approx(0.01**-0.25)
+    with pytest.raises(ValueError, match="no range"):
+        range_from_strength(0.0, 1.0)
+
+
+def test_a_hop_takes_less_than_a_millisecond() -> None:
+    samples = tone(200.0, 0.1, seconds=10.0)
+    best = math.inf
+    for _ in range(3):
+        begin = time.process_time()
+        for one in (found := spectra(samples)):
+            predominant_line(one, DopplerLineSettings())
+        best = min(best, (time.process_time() - begin) / len(found))
+    assert best < 1e-3
+
+
+def recorded(name: str, highest: float) -> list[DopplerLine]:
+    path = CW24 / name
+    if not path.exists():
+        pytest.skip(f"the recording {name} is not here")
+    rate, samples = wavfile.read(path)
+    chosen = DopplerSpectrumSettings(highest=highest)
+    return [predominant_line(one, DopplerLineSettings()) for one in spectra(samples, float(rate), chosen)]
+
+
+def test_a_real_person_walks_at_one_metre_per_second() -> None:
+    """24 GHz, one mixer: the line of the torso."""
+    lines = [line for line in recorded("RadarHumanData_WalkingData.wav", 560.0)[60:] if line.valid]
+    speeds = np.array([line.range_rate for line in lines])
+    assert len(speeds) > 100
+    torso = speeds[speeds > 0.6]
+    assert len(torso) > 0.6 * len(speeds)
+    assert 1.0 <= np.median(torso) <= 1.5
+
+
+def test_a_real_car_comes_at_five_metres_per_second() -> None:
+    """It passes nearly along the beam: a plateau at 5.1 m/s."""
+    lines = recorded("FirthRoad_20kmV1.wav", 1600.0)
+    speeds = np.array([line.range_rate for line in lines if line.valid])
+    plateau = speeds[(speeds > 4.9) & (speeds < 5.5)]
+    assert len(plateau) > 30
+    assert np.median(plateau) == pytest.approx(5.1, abs=0.1)

@@ -1,0 +1,149 @@
+"""The cane's operators, a list in and a list out: no process, no Zenoh."""
+
+import math
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+import pytest
+
+from caneflow.algorithms.rotations import rotate
+from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, RadarFrame, Sample
+from caneflow.messages.rig import Rig, read_rig
+from caneflow.runtime import Context, Operator, Refused
+from caneflow.simulation.scenario import Walk, simulate_walk
+from operators.fusion import Fusion, FusionSettings
+from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings
+
+
+@cache
+def walk() -> Walk:
+    """8 s of a straight walk, the first 2 at rest."""
+    return simulate_walk("straight", seed=3, duration=8.0)
+
+
+def context(rig: Rig) -> Context:
+    return Context(node="test", rig=rig, ports={}, random=np.random.default_rng(0))
+
+
+def samples() -> Iterator[tuple[str, Sample]]:
+    """Frames and IMU readings of the walk, in event time."""
+    made, imu = walk(), walk().imu
+    for i, stamp in enumerate(made.stamps_ns.tolist()):
+        yield (
+            "frame",
+            RadarFrame(
+                stamp=stamp,
+                scans=made.scans[i : i + 1],
+                scan_period=made.scan_period,
+                range_start=made.range_start,
+                range_step=made.range_step,
+                carrier=made.carrier,
+                bandwidth=made.bandwidth,
+            ),
+        )
+        yield (
+            "imu",
+            Imu(
+                stamp=stamp,
+                gyro=tuple(imu.gyro[i].tolist()),
+                accel=tuple(imu.accel[i].tolist()),
+                mag=tuple(imu.mag[i].tolist()),
+                orientation=tuple(imu.orientation[i].tolist()),
+                linear_accel=tuple(imu.linear_accel[i].tolist()),
+            ),
+        )
+
+
+def through(operator: Operator, messages: Iterator[tuple[str, Sample]]) -> list[Sample]:
+    return [out for port, message in messages for _, out in operator.handle(port, message)]
+
+
+def speeds(settings: GroundSpeedSettings | None = None) -> list[GroundSpeed]:
+    operator = GroundSpeedOperator(settings or GroundSpeedSettings(), context(read_rig(walk().rig)))
+    return [out for out in through(operator, samples()) if isinstance(out, GroundSpeed)]
+
+
+def along_boresight(i: int) -> float:
+    """The true velocity along the boresight's projection (m/s): what a radar on a swinging cane measures."""
+    x, y, _ = rotate(tuple(walk().orientation[i].tolist()), (0.0, 1.0, 0.0))
+    vx, vy = walk().velocity[i, :2].tolist()
+    return float((vx * x + vy * y) / math.hypot(x, y))
+
+
+def test_there_is_one_speed_per_frame_with_both_front_ends() -> None:
+    found = speeds()
+    assert [speed.stamp for speed in found] == walk().stamps_ns.tolist()
+    assert not found[0].valid, "a window that is not full says nothing"
+    assert found[0].quality == math.inf
+    resting = [speed for speed in found if 1_000_000_000 < speed.stamp - found[0].stamp < 1_900_000_000]
+    assert {(speed.speed, speed.quality, speed.valid) for speed in resting} == {(0.0, 0.0, True)}
+    truth = float(np.mean([along_boresight(i) for i in range(500, len(walk().stamps_ns))]))  # m/s, walking
+    walking = found[500:]
+    assert np.mean([speed.speed for speed in walking if speed.valid]) == pytest.approx(truth, rel=0.1)
+    forward = [speed.velocity[0] for speed in walking if speed.velocity and speed.velocity_cov]
+    assert np.mean(forward) == pytest.approx(truth, rel=0.1)
+
+
+def test_each_front_end_can_be_switched_off() -> None:
+    assert all(speed.velocity is None for speed in speeds(GroundSpeedSettings(with_velocity=False))[-10:])
+    alone = speeds(GroundSpeedSettings(with_speed=False))[-1]
+    assert (alone.valid, alone.velocity is not None) == (False, True)
+    with pytest.raises(ValueError, match="nothing to say"):
+        GroundSpeedSettings(with_speed=False, with_velocity=False)
+
+
+def test_what_the_rig_lacks_is_named() -> None:
+    with pytest.raises(MessageError, match=r"rig\.hand_height is not known"):
+        GroundSpeedOperator(GroundSpeedSettings(), context(Rig()))
+    with pytest.raises(MessageError, match=r"rig\.step_length is not known"):
+        Fusion(FusionSettings(method="shs"), context(Rig()))
+
+
+def test_an_imu_without_orientation_is_refused_with_the_way_out() -> None:
+    operator = GroundSpeedOperator(GroundSpeedSettings(), context(read_rig(walk().rig)))
+    with pytest.raises(Refused, match=r"operators\.attitude"):
+        list(operator.handle("imu", Imu(stamp=1, gyro=(0.0, 0.0, 0.0))))
+    fusion = Fusion(FusionSettings(), context(Rig()))
+    with pytest.raises(Refused, match="no orientation"):
+        list(fusion.handle("imu", Imu(stamp=1, gyro=(0.0, 0.0, 0.0))))
+
+
+@pytest.mark.parametrize("method", ["luenberger", "kalman", "best"])
+def test_fusion_follows_a_constant_speed_along_the_boresight(method: str) -> None:
+    """The boresight points along x: 1 s of 1 m/s^2, then 3 s of 1 m/s are 3.5 m along x, whatever estimates it."""
+    rig = read_rig({"boresight": [1, 0, 0], "pivot": [-0.3, 0, 0]})
+    fusion = Fusion(FusionSettings(method=method), context(rig))  # type: ignore[arg-type]  # a name from the list above
+    poses: list[Pose] = []
+    for i in range(500):
+        stamp = 1 + i * 10_000_000
+        moving = min(max(i - 100, 0) * 0.01, 1.0)  # m/s
+        gained = 1.0 if 100 <= i < 200 else 0.0  # m/s^2
+        imu = Imu(
+            stamp=stamp,
+            gyro=(0.0, 0.0, 0.0),
+            accel=(gained, 0.0, 9.80665),
+            orientation=(1.0, 0.0, 0.0, 0.0),
+            linear_accel=(gained, 0.0, 0.0),
+        )
+        speed = GroundSpeed(
+            stamp=stamp,
+            speed=moving,
+            quality=0.01,
+            rays=16,
+            valid=True,
+            delay=0.0,
+            velocity=(moving, 0.0),
+            velocity_cov=(1e-4, 0.0, 1e6),
+            velocity_delay=0.0,
+        )
+        for port, message in (("imu", imu), ("speed", speed)):
+            poses += [out for _, out in fusion.handle(port, message) if isinstance(out, Pose)]
+    assert len(poses) == 500
+    assert {pose.method for pose in poses} == {method}
+    assert poses[-1].position[0] == pytest.approx(3.5, abs=0.15)
+    assert poses[-1].position[1] == pytest.approx(0.0, abs=0.1)
+    if method != "luenberger":
+        covariance = poses[-1].covariance
+        assert covariance is not None
+        assert np.linalg.eigvalsh(covariance).min() > 0
