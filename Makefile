@@ -22,7 +22,7 @@ run: $(BIN)/.installed $(WALK)
 	@echo "the paper's mean final error over ten walks: 1.3 m; the picture: build/track.png"
 
 test: $(BIN)/.installed
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2
 
 lint: $(BIN)/.installed
 	$(BIN)/ruff check

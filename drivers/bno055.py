@@ -231,13 +231,13 @@ class Bno055(Source):
 
     def _set_back(self, error: Exception, give_up: float) -> None:
         """Take note that there is no chip; raises DataflowError when there has never been one for too long."""
-        where = f"BNO055 on {self._settings.port}"
+        where, reason = f"BNO055 on {self._settings.port}", reason_of(error)
         if not self._last_stamp and time.monotonic() > give_up:
             raise DataflowError(
-                f"{self._node}: {where}: no sample within {self._settings.start_timeout_s:g} s: {error}; "
+                f"{self._node}: {where}: no sample within {self._settings.start_timeout_s:g} s: {reason}; "
                 "`caneflow doctor --devices` says what to try, --replay REC plays a recording"
             ) from error
-        self._warn(f"{where}: {error}; tries again")
+        self._warn(f"{where}: {reason}; tries again")
 
     def _warn(self, text: str) -> None:
         if text != self._said:
@@ -322,6 +322,13 @@ class Report:
             f"longest {1e3 * spacing.longest:.1f}; reading {1e3 * self._seconds / self._readings:.1f} ms, "
             f"slowest {1e3 * self._slowest:.1f}; {self._pacing.repeated} read again{counted}; {self._faults}"
         )
+
+
+def reason_of(error: Exception) -> str:
+    """What an error says, without its number."""
+    if isinstance(error, termios.error):
+        return os.strerror(error.args[0])
+    return getattr(error, "strerror", None) or str(error)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ So seconds of unplugged cables and hung chips pass at once. That it works over a
 import json
 import logging
 import math
+import re
 import termios
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -193,8 +194,8 @@ def test_an_unplugged_chip_comes_back_within_a_second_and_the_gap_is_told(
     stamps = [sample.stamp for _, sample in got]
     assert all(a < b for a, b in pairwise(stamps))
     assert max(b - a for a, b in pairwise(stamps)) == pytest.approx((after - before) * 1e9, abs=10e6)
-    assert caplog.messages[0] == "BNO055 on /dev/serial0: [Errno 5] Input/output error; tries again"
-    assert len(caplog.messages) < 5, "it does not repeat itself"
+    assert caplog.messages[0] == "BNO055 on /dev/serial0: Input/output error; tries again"
+    assert len(caplog.messages) < 4, "it does not repeat itself"
 
 
 def test_a_cable_that_is_back_soon_does_not_restart_the_fusion(source: Any) -> None:
@@ -300,7 +301,7 @@ def test_it_tells_once_a_minute(source: Any, caplog: pytest.LogCaptureFixture) -
     brought(source(on), on, 62.0)
     lines = [message for message in caplog.messages if "samples every" in message]
     assert len(lines) == 2, "after a minute, and at the end"
-    assert "samples every 10.00" in lines[0]
+    assert re.match(r"59\d\d samples every (9\.99|10\.00)\d ms, jitter 0\.\d\d, ", lines[0])
     assert "overruns" in lines[0]
     assert "missed" not in lines[0]
 

@@ -45,7 +45,10 @@ class RoomEkfSettings:
     use_strength: bool = True
     use_heading: bool = True
     walk_noise: Annotated[float, Gt(0)] = 1.1  # m/s/sqrt(s), without an IMU, on each axis
+    walk_time: Annotated[float, Gt(0)] = 5.0  # s, in which it comes back to 0
     along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), with an IMU, along the heading
+    along_time: Annotated[float, Gt(0)] = 2.0  # s, in which it comes back to the usual speed
+    usual_speed: Annotated[float, Ge(0)] = 0.9  # m/s, of somebody who walks
     across_noise: Annotated[float, Gt(0)] = 0.3  # m/s/sqrt(s), with an IMU, across it
     across_speed: Annotated[float, Gt(0)] = 0.1  # m/s, sd of the speed across the heading
     yaw_error: Annotated[float, Ge(0)] = math.radians(7.0)  # rad, sd of beta
@@ -60,10 +63,12 @@ class RoomEkfSettings:
     gamma_error: Annotated[float, Ge(0)] = 0.0
     reference_range: Annotated[float, Gt(0)] = 6.0  # m, where k is right whatever gamma
     range_error: Annotated[float, Gt(0)] = 0.1  # m, of sensors that measure it
+    edge_error: Annotated[float, Gt(0)] = 1.0  # m, sd of how far beyond the area's edge somebody may be
     degrees: Annotated[float, Gt(2)] = 4.0  # of freedom of the Student-t that all errors are taken to have
     gate: Annotated[float, Gt(1)] = 5.0  # sd beyond which a measurement is discarded
-    hold_after: Annotated[float, Gt(0)] = 0.4  # s without a valid echo, after which the position is held
+    hold_after: Annotated[float, Gt(0)] = 1.0  # s without a valid echo, after which the position is held
     hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
+    hold_speed: Annotated[float, Ge(0)] = 0.3  # m/s, sd of each component of the velocity then
     hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
     start_speed: Annotated[float, Gt(0)] = 0.7  # m/s, sd of each component before anything is known
     heading_timeout: Annotated[float, Gt(0)] = 0.5  # s, after which the IMU counts as silent
@@ -81,6 +86,7 @@ class RoomEkf:
         self._settings = settings
         self._sensors = dict(sensors)
         self._place = {name: BIASES + index for index, name in enumerate(self._sensors)}
+        self._area = start.area
         self._headings = HeadingHistory()
         self._silence = SilenceWatch(settings.hold_after)
         self._now_ns: int | None = None
@@ -143,6 +149,7 @@ class RoomEkf:
         self._now_ns = stamp_ns
         if moving and self._heading_known(stamp_ns):
             self._take_heading(stamp_ns)
+        self._stay_inside()
 
     def _heading_known(self, stamp_ns: int) -> bool:
         return self._headings.age(stamp_ns) < self._settings.heading_timeout
@@ -152,42 +159,59 @@ class RoomEkf:
         s = self._settings
         dt = (stamp_ns - self._now_ns) * 1e-9
         size = len(self._state)
-        f = np.eye(size)
-        q = np.zeros(size)
-        cross = 0.0
+        f, q, drift = np.eye(size), np.zeros((size, size)), np.zeros(size)
         if not moving:
-            decay = math.exp(-dt / s.hold_decay)
-            f[U, U] = f[V, V] = decay
-            q[X] = q[Y] = s.hold_noise**2 * dt
-            q[U] = q[V] = (1.0 - decay**2) * 0.3**2
+            self._hold(dt, f, q)
         elif self._heading_known(stamp_ns):
-            travel = self._headings.travel(self._now_ns, stamp_ns)
-            start = travel.yaw - travel.turned
-            c, n = math.cos(start), math.sin(start)
-            along, aside = c * travel.east + n * travel.north, c * travel.north - n * travel.east
-            f[X, U], f[X, V], f[Y, U], f[Y, V] = along, -aside, aside, along
-            c, n = math.cos(travel.turned), math.sin(travel.turned)
-            f[U, U], f[U, V], f[V, U], f[V, V] = c, -n, n, c
-            yaw = travel.yaw + float(self._state[BETA])
-            c, n = math.cos(yaw), math.sin(yaw)
-            a, b = s.along_noise**2 * dt, s.across_noise**2 * dt
-            q[U], q[V], cross = a * c * c + b * n * n, a * n * n + b * c * c, (a - b) * c * n
+            self._walk_along(stamp_ns, dt, f, q, drift)
         else:
-            f[X, U] = f[Y, V] = dt
-            q[U] = q[V] = s.walk_noise**2 * dt
-        q[X] += q[U] * dt * dt / 3.0
-        q[Y] += q[V] * dt * dt / 3.0
+            self._walk_anywhere(dt, f, q)
         f[BETA, BETA] = math.exp(-dt / s.yaw_time)
-        q[BETA] = (1.0 - f[BETA, BETA] ** 2) * s.yaw_error**2
+        q[BETA, BETA] = (1.0 - f[BETA, BETA] ** 2) * s.yaw_error**2
         keep = math.exp(-dt / s.bias_time)
         for place in self._place.values():
             f[place, place] = keep
-            q[place] = (1.0 - keep**2) * s.bias_error**2
-        covariance = f @ self._covariance @ f.T
-        covariance[np.arange(size), np.arange(size)] += q
-        covariance[U, V] += cross
-        covariance[V, U] += cross
-        return f @ self._state, covariance
+            q[place, place] = (1.0 - keep**2) * s.bias_error**2
+        return f @ self._state + drift, f @ self._covariance @ f.T + q
+
+    def _hold(self, dt: float, f: Array, q: Array) -> None:
+        """Nothing moves, or nobody sees it: the velocity dies away, the position may creep."""
+        decay = math.exp(-dt / self._settings.hold_decay)
+        f[U, U] = f[V, V] = decay
+        f[X, U] = f[Y, V] = self._settings.hold_decay * (1.0 - decay)
+        q[X, X] = q[Y, Y] = self._settings.hold_noise**2 * dt
+        q[U, U] = q[V, V] = (1.0 - decay**2) * self._settings.hold_speed**2
+
+    def _walk_anywhere(self, dt: float, f: Array, q: Array) -> None:
+        """Without an IMU: a random walk of the velocity that comes back to 0."""
+        s = self._settings
+        decay = math.exp(-dt / s.walk_time)
+        f[X, U] = f[Y, V] = s.walk_time * (1.0 - decay)
+        f[U, U] = f[V, V] = decay
+        q[U, U] = q[V, V] = s.walk_noise**2 * dt
+        q[X, X] = q[Y, Y] = q[U, U] * dt * dt / 3.0
+
+    def _walk_along(self, stamp_ns: int, dt: float, f: Array, q: Array, drift: Array) -> None:
+        """With an IMU: the velocity turns with it, and comes back to the usual speed along the heading."""
+        assert self._now_ns is not None
+        s = self._settings
+        travel = self._headings.travel(self._now_ns, stamp_ns)
+        decay = math.exp(-dt / s.along_time)
+        first = travel.yaw - travel.turned
+        c, n = math.cos(first), math.sin(first)
+        along, aside = c * travel.east + n * travel.north, c * travel.north - n * travel.east
+        f[X, U], f[X, V], f[Y, U], f[Y, V] = along, -aside, aside, along
+        c, n = decay * math.cos(travel.turned), decay * math.sin(travel.turned)
+        f[U, U], f[U, V], f[V, U], f[V, V] = c, -n, n, c
+        yaw = travel.yaw + float(self._state[BETA])
+        c, n = math.cos(yaw), math.sin(yaw)
+        gained = (1.0 - decay) * s.usual_speed
+        drift[U], drift[V] = gained * (c + n * self._state[BETA]), gained * (n - c * self._state[BETA])
+        f[U, BETA], f[V, BETA] = -gained * n, gained * c
+        a, b = s.along_noise**2 * dt, s.across_noise**2 * dt
+        q[U, U], q[V, V] = a * c * c + b * n * n, a * n * n + b * c * c
+        q[U, V] = q[V, U] = (a - b) * c * n
+        q[X, X], q[Y, Y] = q[U, U] * dt * dt / 3.0, q[V, V] * dt * dt / 3.0
 
     def _take_heading(self, stamp_ns: int) -> None:
         """The velocity is along the heading: what it has across is 0."""
@@ -200,6 +224,18 @@ class RoomEkf:
         h[U], h[V], h[BETA] = -n, c, -(c * u + n * v)
         # one measurement of this error per 0.25 s, however often it is made
         self._correct(h, n * u - c * v, self._settings.across_speed**2 * 0.25 / max(dt, 1e-3))
+
+    def _stay_inside(self) -> None:
+        """Whoever is found outside of the area is drawn to its edge."""
+        if self._area is None:
+            return
+        for place, low, high in ((X, self._area[0], self._area[1]), (Y, self._area[2], self._area[3])):
+            at = float(self._state[place])
+            beyond = min(at - low, 0.0) + max(at - high, 0.0)
+            if beyond:
+                h = np.zeros(len(self._state))
+                h[place] = 1.0
+                self._correct(h, -beyond, self._settings.edge_error**2)
 
     def _sight(self, sensor: StaticSensor) -> tuple[float, float, float]:
         """Distance to the person, and the direction to them."""

@@ -112,7 +112,8 @@ def final_offset(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0
     In the estimate's own frame, which is that of its covariance; its length is `final_error`.
     """
     track, path, turn = aligned(estimate, truth, boresight=boresight)
-    return _turned(track[-1:] - path[-1:], -turn)[0]
+    offset: Floats = _turned(track[-1:] - path[-1:], -turn)[0]
+    return offset
 
 
 def boresight_yaws(orientations: Floats, boresight: Vector) -> Floats:
