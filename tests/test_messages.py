@@ -159,7 +159,7 @@ NAN = float("nan")
         (FRAME, {"range_start": NAN}, "range_start"),
         (SPEED, {"quality": NAN}, "quality is nan"),
         (SPEED, {"quality": -0.1}, "quality is -0.1"),
-        (SPEED, {"speed": math.inf}, "speed is (inf,)"),
+        (SPEED, {"speed": math.inf}, "speed, delay, velocity_delay is (inf,"),
         (SPEED, {"valid": 1}, "Expected `bool`, got `int`"),
         (SPEED, {"velocity_cov": [-1.0, 0.0, 1.0]}, "variances are 0 or more"),
         (POSE, {"covariance": np.eye(5)}, "covariance has shape (5, 5), not (6, 6)"),

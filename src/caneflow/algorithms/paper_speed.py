@@ -196,7 +196,8 @@ class PaperSpeed:
             return _nothing(delay)
         ordered = sorted(speeds)
         middle = 0.5 * (ordered[count // 2] + ordered[(count - 1) // 2])
-        agreeing = bisect_right(ordered, middle + settings.agreement) - bisect_left(ordered, middle - settings.agreement)
+        low, high = middle - settings.agreement, middle + settings.agreement
+        agreeing = bisect_right(ordered, high) - bisect_left(ordered, low)
         if agreeing < settings.fewest_rays:
             return _nothing(delay)
         weights = falls if settings.average == "weighted" else [1.0] * count
