@@ -50,9 +50,8 @@ def test_flat_rows_and_falls_at_the_rim_give_no_nonsense() -> None:
     rows[2, 0] = 9
     rows[3, :15] = 9
     edges, falls = superior_edges(rows)
-    assert np.isfinite(edges).all()
-    assert ((edges >= 0) & (edges <= 15)).all()
-    assert falls[:2].tolist() == [0, 0]
+    assert all(0 <= edge <= 15 for edge in edges)
+    assert falls[:2] == [0, 0]
 
 
 @pytest.mark.parametrize("length", [32, 64, 128])
@@ -65,7 +64,7 @@ def test_the_edge_of_a_single_line_lies_0_94_cells_beyond_it(length: int) -> Non
     lines = 5 + np.linspace(0, 1, 9)  # cells
     tones = np.exp(2j * math.pi * lines[:, None] * n / length) * hann(length)
     edges, _ = superior_edges(np.abs(np.fft.fft(tones, PADDING * length, axis=1))[:, : PADDING * length // 2])
-    assert edges / PADDING - lines == pytest.approx(np.full(9, formula), abs=0.02)
+    assert np.array(edges) / PADDING - lines == pytest.approx(np.full(9, formula), abs=0.02)
 
 
 @pytest.mark.parametrize("fastest", [3.0, 5.0, 7.0, 9.0, 12.0])

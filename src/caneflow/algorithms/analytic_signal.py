@@ -46,5 +46,4 @@ class AnalyticSignal:
         spectrum = np.zeros(scans.shape, np.complex64)
         band = slice(self._first, self._end)
         np.multiply(one_sided[..., band], 2 * self._bins, out=spectrum[..., band])
-        signal: NDArray[np.complex64] = np.fft.ifft(spectrum)
-        return signal
+        return np.fft.ifft(spectrum).astype(np.complex64, copy=False)  # it is; the stub says complex128
