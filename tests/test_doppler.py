@@ -110,9 +110,9 @@ def test_lamp_hum_is_part_of_the_floor() -> None:
     """A line that never goes away is no person, though it is the strongest."""
     random = np.random.default_rng(2)
     at = np.arange(round(30 * RATE)) / RATE
-    hum = 0.02 * np.cos(2 * np.pi * 100.0 * at)
-    walker = np.where(at > 20.0, 0.005 * np.cos(2 * np.pi * 190.0 * at), 0.0)
-    samples = (hum + walker + 1e-4 * random.standard_normal(len(at))).astype(np.float32)
+    hum = 0.003 * np.cos(2 * np.pi * 100.0 * at)
+    walker = np.where(at > 20.0, 0.001 * np.cos(2 * np.pi * 190.0 * at), 0.0)
+    samples = (hum + walker + 1e-3 * random.standard_normal(len(at))).astype(np.float32)
     line = predominant_line(spectra(samples)[-1], DopplerLineSettings(least_share=0.0))
     assert line.range_rate == pytest.approx(190.0 / 160.93, rel=0.02)
 

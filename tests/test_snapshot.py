@@ -65,7 +65,7 @@ def same(a: Any, b: Any) -> bool:
 @pytest.mark.parametrize(
     "value",
     [
-        None, True, 0, -(2**63), 2**200, 0.1, math.inf, -0.0, "text", b"bytes", (1, (2.0, "x")), [1, [2]],
+        None, True, 0, 1 - 2j, -(2**63), 2**200, 0.1, math.inf, -0.0, "text", b"bytes", (1, (2.0, "x")), [1, [2]],
         {"a": 1, 3: (4,)}, {1, 2}, frozenset("ab"), deque([1, 2], maxlen=2), Point(1.0, 2.0), Colour.RED,
         Settings(0.25), np.float32(0.1), np.arange(6, dtype=np.int16).reshape(2, 3), np.zeros((0, 3)), np.array(5.0),
         np.asfortranarray(np.arange(6.0).reshape(2, 3)), np.array([1 + 2j], np.complex64), np.dtype("<f4"),

@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
 
 INT16_FULL_SCALE = 32768.0
 SMOOTHING = 0.95  # per hop, of the spectrum whose minimum is taken: 1 s at the hop of 50 ms
@@ -21,6 +21,8 @@ FLOOR_BIAS = 0.565  # that minimum over 20 s of white noise, relative to its mea
 QUARTILE = 0.288  # lower quartile of one spectrum of white noise, relative to its mean: ln(4/3)
 SETTLING = 20  # spectra before the first minimum is taken
 PARTS = 8  # of the memory; the oldest is forgotten as a whole
+BROAD = 21  # bins, 40 Hz; a line fills 4
+SMEAR = 30.0  # over the lower quartile of the floor, 15 dB: as much as 1/f noise may rise at the low end
 LEAST_POWER = 1e-16  # of full scale: far below the last bit of any converter
 
 
@@ -155,7 +157,7 @@ class SlidingSpectrum:
 class NoiseFloor:
     """Per bin the minimum of the smoothed power over the last `memory` spectra.
 
-    Until there has been time for a minimum, a line that stands would be taken for noise; so at first no bin's floor
+    Somebody who walks for long at one speed leaves a broad rise, which is taken off. Until there has been time for a minimum, a line that stands would be taken for noise; so at first no bin's floor
     is above what the quieter bins have.
     """
 
@@ -181,7 +183,14 @@ class NoiseFloor:
         floor = np.asarray(np.min(self._minima, axis=0), dtype=np.float64) / FLOOR_BIAS
         if self._count <= self._part:
             np.minimum(floor, np.quantile(floor, 0.25), out=floor)
-        return self._raised(floor)
+        return self._raised(self._without_smear(floor))
+
+    @staticmethod
+    def _without_smear(floor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What is both broad and far above the quiet bins is a person who walked on and on, not noise; hum is narrow."""
+        broad = ndimage.median_filter(floor, size=BROAD, mode="nearest")
+        highest = SMEAR * np.quantile(floor, 0.25)
+        return np.asarray(floor * np.minimum(1.0, highest / broad), dtype=np.float64)
 
     @staticmethod
     def _raised(floor: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -56,6 +56,8 @@ class _Packer:
             return value
         if type(value) is int:
             return value if value in INT64 else ["int", str(value)]
+        if type(value) is complex:
+            return ["complex", value.real, value.imag]
         if isinstance(value, np.generic):
             return ["scalar", value.dtype.str, value.tobytes()]
         if id(value) in self._numbers:
@@ -154,6 +156,9 @@ class _Unpacker:
 
     def _int(self, digits: str) -> int:
         return int(digits)
+
+    def _complex(self, real: float, imaginary: float) -> complex:
+        return complex(real, imaginary)
 
     def _scalar(self, dtype: str, data: bytes) -> Any:
         return np.frombuffer(data, dtype)[0]

@@ -171,7 +171,7 @@ def standing(place: Floats, heading: float, duration: float) -> Trajectory:
 _NODE = 0.02  # m between the points of a curve
 _PACE_NODE = 0.02  # m between the points at which a speed is set
 _SPAN = 0.45  # m/s: the pace stays within 1.0 +- 0.45 m/s, so that bob and rounding leave it in 0.5..1.5
-_SHARP = 135.0 * DEGREE  # rad; a sharper corner is turned on the spot
+_SHARP = 105.0 * DEGREE  # rad; a sharper corner is turned on the spot, else a walker would spin at over 300 deg/s
 
 
 def _sampled(
