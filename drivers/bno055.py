@@ -4,6 +4,7 @@ out  imu : Imu   gyro, acceleration, magnetic field, the chip's own attitude, 10
 """
 
 import logging
+import math
 import os
 import termios
 import time
@@ -96,20 +97,21 @@ class Bno055(Source):
         self._quiet_until = 0  # ns
         self._levels = (0, 0, 0, 0)
         self._said = ""  # the last warning
+        self._give_up = math.inf  # s, monotonic, unless there is a sample by then
         self._next_revival = 0.0  # s, monotonic
         self._pacing = Pacing(settings.rate, time.monotonic())
         self._report = Report(self._pacing, 1.0 / settings.rate)
 
     def samples(self) -> Brought:
         """Yield what the chip measures; raises DataflowError when it gives no sample at the start."""
-        give_up = time.monotonic() + self._settings.start_timeout_s
+        self._give_up = time.monotonic() + self._settings.start_timeout_s
         try:
             while True:
                 try:
                     with opened(self._settings) as link:
                         yield from self._stay(Chip(link, time.sleep))
                 except LOST as error:
-                    self._set_back(error, give_up)
+                    self._set_back(error)
                 yield self._quiet()
                 time.sleep(RETRY)
         finally:
@@ -120,7 +122,7 @@ class Bno055(Source):
         yield from self._found(chip)
         if not (self._set_up_before and chip.works_as(self._setup)):
             chip.set_up(self._setup)
-            self._set_up_before = True
+            self._set_up_before, self._next_revival = True, time.monotonic() + REVIVAL_PERIOD
         try:
             yield from self._measured(chip)
         except LOST:
@@ -170,9 +172,10 @@ class Bno055(Source):
                 early = reading.stamp
                 continue
             stamp, early = early or reading.stamp, None
-            if verdict is Verdict.NEW and self._is_later(stamp):
+            if verdict is Verdict.NEW:
                 sampled = now
-                yield "imu", self._sample(stamp, reading.said)
+                if self._is_later(stamp):
+                    yield "imu", self._sample(stamp, reading.said)
             elif now - max(sampled, asked) > (IN_DOUBT_AFTER if asked <= sampled else ASK_AGAIN):
                 asked = now
                 self._ask(chip, verdict)
@@ -207,10 +210,12 @@ class Bno055(Source):
 
     def _is_later(self, stamp: int) -> bool:
         """Whether a sample may have this stamp: not while a clock that was set back has not caught up."""
-        if stamp > max(self._last_stamp, self._quiet_until):
+        ahead = max(self._last_stamp, self._quiet_until) - stamp
+        if ahead < 0:
             return True
+        if not self._report.clock_back:
+            log.warning("the clock was set back by %.3f s: no samples until it has caught up", ahead / 1e9)
         self._report.clock_back += 1
-        self._warn(f"the clock was set back by {(self._last_stamp - stamp) / 1e9:.3f} s; no samples until then")
         return False
 
     def _quiet(self) -> Quiet:
@@ -219,20 +224,27 @@ class Bno055(Source):
         return Quiet(self._quiet_until)
 
     def _ask(self, chip: Chip, verdict: Verdict | None) -> None:
-        """Find out why there are no samples; raises ProtocolError when the chip has to be set up anew."""
+        """Find out why there are no samples; raises ProtocolError when something can be done about it."""
         state = chip.state()
         if not chip.works_as(self._setup):
             raise ProtocolError(f"the chip was reset: {state}; is set up anew")
-        if verdict is not Verdict.FROZEN:
-            self._warn(f"the chip gives no orientation: {state}")
-        elif (now := time.monotonic()) > self._next_revival:
-            self._set_up_before, self._next_revival = False, now + REVIVAL_PERIOD
-            raise ProtocolError(f"the values stand still: {state}; is set up anew")
+        what = "the values stand still" if verdict is Verdict.FROZEN else "the chip gives no orientation"
+        now = time.monotonic()
+        if now > self._next_revival:
+            chip.reset()
+            raise ProtocolError(f"{what}: {state}; was reset")
+        if self._is_given_up(now):
+            raise ProtocolError(f"{what}: {state}")
+        self._warn(f"{what}: {state}")
 
-    def _set_back(self, error: Exception, give_up: float) -> None:
-        """Take note that there is no chip; raises DataflowError when there has never been one for too long."""
+    def _is_given_up(self, now: float) -> bool:
+        """Whether there has never been a sample, for too long."""
+        return not self._last_stamp and now > self._give_up
+
+    def _set_back(self, error: Exception) -> None:
+        """Take note that there is no chip; raises DataflowError when it is given up."""
         where, reason = f"BNO055 on {self._settings.port}", reason_of(error)
-        if not self._last_stamp and time.monotonic() > give_up:
+        if self._is_given_up(time.monotonic()):
             raise DataflowError(
                 f"{self._node}: {where}: no sample within {self._settings.start_timeout_s:g} s: {reason}; "
                 "`caneflow doctor --devices` says what to try, --replay REC plays a recording"

@@ -154,12 +154,8 @@ def circling() -> Trajectory:
     return Trajectory(*(values[: 60 * RATE] for values in way))
 
 
-def worn(
-    way: Trajectory, settings: BeltImuSettings = IDEAL, who: PersonSettings = PLAIN, seed: int = 3
-) -> BeltSamples:
-    return measure(
-        walker(way, who), belt(settings, default_rng(4)), settings, default_rng(seed), default_rng(9)
-    )
+def worn(way: Trajectory, settings: BeltImuSettings = IDEAL, who: PersonSettings = PLAIN, seed: int = 3) -> BeltSamples:
+    return measure(walker(way, who), belt(settings, default_rng(4)), settings, default_rng(seed), default_rng(9))
 
 
 def test_the_gyro_integrates_to_the_heading() -> None:

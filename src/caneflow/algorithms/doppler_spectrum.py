@@ -157,8 +157,8 @@ class SlidingSpectrum:
 class NoiseFloor:
     """Per bin the minimum of the smoothed power over the last `memory` spectra.
 
-    Somebody who walks for long at one speed leaves a broad rise, which is taken off. Until there has been time for a minimum, a line that stands would be taken for noise; so at first no bin's floor
-    is above what the quieter bins have.
+    Somebody who walks for long at one speed leaves a broad rise, which is taken off. Until there has been time for a
+    minimum, a line that stands would be taken for noise; so at first no bin's floor is above the quieter bins'.
     """
 
     def __init__(self, memory: int) -> None:
@@ -187,7 +187,7 @@ class NoiseFloor:
 
     @staticmethod
     def _without_smear(floor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is both broad and far above the quiet bins is a person who walked on and on, not noise; hum is narrow."""
+        """What is both broad and far above the quiet bins is a person who walked on and on; hum is narrow."""
         broad = ndimage.median_filter(floor, size=BROAD, mode="nearest")
         highest = SMEAR * np.quantile(floor, 0.25)
         return np.asarray(floor * np.minimum(1.0, highest / broad), dtype=np.float64)

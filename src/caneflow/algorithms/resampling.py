@@ -13,9 +13,10 @@ def systematic(weights: NDArray[np.float64], random: np.random.Generator) -> NDA
     """Indices, shape (N,), increasing, of the particles to copy; `weights`, shape (N,), are not negative."""
     count = len(weights)
     cumulated = np.cumsum(weights)
-    cumulated /= cumulated[-1]  # rounding must not leave a tooth beyond the last particle
-    teeth = (np.arange(count) + random.random()) / count
-    return np.searchsorted(cumulated, teeth, side="right").clip(max=count - 1)
+    # how many teeth (i + r) / N lie below each cumulated weight; the last is N whatever the rounding
+    below = np.ceil(cumulated * (count / cumulated[-1]) - random.random()).astype(np.intp).clip(0, count)
+    below[-1] = count
+    return np.repeat(np.arange(count), np.diff(below, prepend=0))
 
 
 def effective_number(weights: NDArray[np.float64]) -> float:

@@ -45,7 +45,7 @@ class RoomEkfSettings:
     use_strength: bool = True
     use_heading: bool = True
     walk_noise: Annotated[float, Gt(0)] = 1.1  # m/s/sqrt(s), without an IMU, on each axis
-    walk_time: Annotated[float, Gt(0)] = 5.0  # s, in which it comes back to 0
+    walk_time: Annotated[float, Gt(0)] = 2.0  # s, in which it comes back to 0
     along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), with an IMU, along the heading
     along_time: Annotated[float, Gt(0)] = 2.0  # s, in which it comes back to the usual speed
     usual_speed: Annotated[float, Ge(0)] = 0.9  # m/s, of somebody who walks
@@ -54,7 +54,7 @@ class RoomEkfSettings:
     yaw_error: Annotated[float, Ge(0)] = math.radians(7.0)  # rad, sd of beta
     yaw_time: Annotated[float, Gt(0)] = 20.0  # s, correlation of beta
     speed_error: Annotated[float, Gt(0)] = 0.12  # m/s
-    speed_share: Annotated[float, Gt(0), Le(1)] = 0.35  # of an echo that is new: windows overlap
+    speed_share: Annotated[float, Gt(0), Le(1)] = 0.6  # of an echo that is new: windows overlap
     strength_error: Annotated[float, Gt(0)] = 4.0  # dB, fast fading
     strength_share: Annotated[float, Gt(0), Le(1)] = 0.3
     bias_error: Annotated[float, Ge(0)] = 1.5  # dB, sd of b

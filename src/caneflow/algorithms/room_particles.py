@@ -47,8 +47,9 @@ class RoomParticleSettings:
     use_strength: bool = True
     use_heading: bool = True
     particles: ParticleSettings = field(default_factory=ParticleSettings)
-    walk_noise: Annotated[float, Gt(0)] = 1.1  # m/s/sqrt(s), on each axis
+    walk_noise: Annotated[float, Gt(0)] = 1.0  # m/s/sqrt(s), on each axis
     along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), of the speed along the heading
+    turn_speed: Annotated[float, Ge(0)] = 1.0  # m/s, of noise per rad that the IMU has turned: it errs so
     fastest: Annotated[float, Gt(0)] = 2.0  # m/s
     start_speed: Annotated[float, Ge(0)] = 0.7  # m/s, sd of each component
     speed_error: Annotated[float, Gt(0)] = 0.12  # m/s
@@ -59,12 +60,13 @@ class RoomParticleSettings:
     degrees: Annotated[float, Gt(0)] = 4.0  # of freedom of the strength's Student-t
     range_error: Annotated[float, Gt(0)] = 0.1  # m, of sensors that measure it
     heading_error: Annotated[float, Gt(0)] = math.radians(7.0)  # rad
-    heading_share: Annotated[float, Gt(0), Le(1)] = 0.3
+    heading_share: Annotated[float, Gt(0), Le(1)] = 0.1
     heading_time: Annotated[float, Gt(0)] = 20.0  # s, correlation of the yaw's error
     turn_noise: Annotated[float, Gt(0)] = 1.0  # rad/sqrt(s), of a heading that nobody measures
+    edge_share: Annotated[float, Ge(0)] = 0.5  # 1/m^2: how fast it becomes unlikely to be outside of the area
     consistent: Annotated[float, Gt(0)] = 3.0  # sd: a measurement farther from every particle is discarded
-    roughening: Annotated[float, Ge(0)] = 0.01  # m, after resampling
-    hold_after: Annotated[float, Gt(0)] = 0.4  # s without a valid echo, after which the position is held
+    roughening: Annotated[float, Ge(0)] = 0.03  # m, after resampling
+    hold_after: Annotated[float, Gt(0)] = 1.0  # s without a valid echo, after which the position is held
     hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
     hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
     heading_timeout: Annotated[float, Gt(0)] = 0.5  # s, after which the IMU counts as silent
@@ -82,6 +84,7 @@ class _RoomParticles(ABC):
     ) -> None:
         self._settings = settings
         self._sensors = dict(sensors)
+        self._area = start.area
         self._random = random
         self._headings = HeadingHistory()
         self._silence = SilenceWatch(settings.hold_after)
@@ -164,6 +167,11 @@ class _RoomParticles(ABC):
                 weight += s.speed_share * normal_with_outliers(
                     residual, s.speed_error, s.speed_outliers, 2.0 * s.fastest
                 )
+        if self._area is not None:
+            west, east, south, north = self._area
+            px, py = self._particles.states[0], self._particles.states[1]
+            beyond = np.maximum(np.maximum(west - px, px - east), np.maximum(south - py, py - north))
+            weight -= s.edge_share * np.maximum(beyond, 0.0) ** 2
         self._particles.weigh(weight)
 
     def _consistent(self, residuals: Array, error: float) -> bool:
@@ -189,7 +197,13 @@ class ParticleTracker(_RoomParticles):
 
     def _move(self, stamp_ns: int, dt: float) -> None:
         s, states = self._settings, self._particles.states
-        states[2:] += s.walk_noise * math.sqrt(dt) * self._random.standard_normal((2, states.shape[1]))
+        turned = 0.0
+        if self._heading_known(stamp_ns):
+            assert self._now_ns is not None
+            turned = self._headings.travel(self._now_ns, stamp_ns).turned
+        # who turns by an angle changes their velocity by as much; constant velocity alone would lose them
+        spread = math.hypot(s.walk_noise * math.sqrt(dt), s.turn_speed * turned)
+        states[2:] += spread * self._random.standard_normal((2, states.shape[1]))
         speed = np.maximum(np.sqrt(states[2] ** 2 + states[3] ** 2), 1e-9)
         if speed.max() > s.fastest:
             states[2:] *= np.minimum(1.0, s.fastest / speed)
@@ -284,5 +298,5 @@ def expected_strength(sensor: StaticSensor, k: float, x: Array, y: Array, distan
     """dB, of an echo from (x, y) m off the sensor, `distance` away: k / R^4 and the antenna's pattern; shape (N,)."""
     # cosine of the angle off the boresight, without an arctangent
     cosine = (x * math.cos(sensor.azimuth) + y * math.sin(sensor.azimuth)) / distance
-    pattern = np.maximum(cosine, LEAST_COSINE) ** PATTERN_EXPONENT
-    return np.asarray(DECIBEL * np.log(k * pattern / distance**4), dtype=np.float64)
+    log_pattern = PATTERN_EXPONENT * np.log(np.maximum(cosine, LEAST_COSINE))
+    return np.asarray(DECIBEL * (math.log(k) + log_pattern - 4.0 * np.log(distance)), dtype=np.float64)

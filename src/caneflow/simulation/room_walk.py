@@ -267,8 +267,8 @@ def _head(walk: Gait, who: Person) -> Floats:
 
 
 def _arm(walk: Gait, who: Person, side: float) -> list[Floats]:
-    """Middle of the upper arm, middle of the forearm, and hand; an arm swings with the other side's leg."""
-    turn = 2.0 * np.pi * (walk.strides + (0.0 if side > 0.0 else 0.5))
+    """Middle of the upper arm, middle of the forearm, and hand; an arm goes back while its side's leg goes ahead."""
+    turn = 2.0 * np.pi * (walk.strides + (0.5 if side > 0.0 else 0.0))
     swing = who.amplitudes[5] * 9.88 * DEGREE * walk.relative
     shoulder = -swing * np.cos(turn) + 3.0 * DEGREE - 0.5 * swing
     elbow = shoulder + 12.0 * DEGREE + np.minimum(walk.relative, 1.3) * 12.0 * DEGREE * (1.0 - np.cos(turn))
