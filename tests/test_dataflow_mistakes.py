@@ -122,7 +122,7 @@ nodes:
     assert lines[0] == "2:1: colour: unknown key; allowed are flow, machines, nodes, results, rig, seed"
     assert lines[1] == "3:42: rig.hand_height: is 'tall'; it takes a number, above 0 (m, of the hand above ground)"
     assert re.match(r"5:14: nodes\.imu\.run: no program 'drivers\.nosuch' in .*drivers.*operators; ", lines[2])
-    assert "there are drivers.bno055, drivers.p440" in lines[2]
+    assert "there are drivers.bno055, drivers.doppler_adc" in lines[2]
     assert lines[3].startswith("6:30: nodes.radar.restarts: unknown key; did you mean 'restart'? allowed are ext")
     assert lines[4] == (
         "7:42: nodes.speed.inputs.frame: no output 'radar/frames'; did you mean 'radar/frame'? "

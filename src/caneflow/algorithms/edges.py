@@ -26,17 +26,16 @@ def superior_edges(magnitudes: NDArray[np.floating]) -> tuple[list[float], list[
     falls = magnitudes[:, :-1] - magnitudes[:, 1:]
     steepest = falls[:, 1:-1].argmax(axis=1)  # counted from column 1: with a neighbour on either side
     before, top, after = falls.take(steepest + _around(*falls.shape)).tolist()
-    # The difference between columns i and i + 1 belongs half way between them.
-    edges = [i + 1.5 + _vertex(b, t, a) for i, b, t, a in zip(steepest.tolist(), before, top, after, strict=True)]
+    edges = []
+    # Plain Python from here on: for a handful of numbers, numpy's calls cost more.
+    for column, left, middle, right in zip(steepest.tolist(), before, top, after, strict=True):
+        rise, drop = middle - left, middle - right
+        if rise < 0.0 or drop < 0.0:  # a neighbour at the rim falls still steeper
+            shift = -0.5 if rise < drop else 0.5
+        else:
+            shift = 0.5 * (rise - drop) / (rise + drop) if rise + drop > 0.0 else 0.0
+        edges.append(column + 1.5 + shift)  # the difference between columns i and i + 1 belongs half way between them
     return edges, top
-
-
-def _vertex(before: float, top: float, after: float) -> float:
-    """Where the parabola through three neighbours has its top, in columns from the middle one; 0 if they are equal."""
-    rise, drop = top - before, top - after
-    if rise < 0.0 or drop < 0.0:  # a neighbour at the rim falls still steeper
-        return -0.5 if rise < drop else 0.5
-    return 0.5 * (rise - drop) / (rise + drop) if rise + drop > 0.0 else 0.0
 
 
 @cache

@@ -86,6 +86,6 @@ class RayCaster:
         rows = scaled.astype(np.intp)
         # A ray's angle is that of its bin's centre: rounding would cost up to 2 % of speed at steep angles.
         # Plain Python: for a handful of numbers, numpy's calls cost more.
-        square, steepest = height * height, math.sin(fan.steepest) ** 2
-        sines = [min(square / self._squares[row], steepest) for row in rows[1:-1].tolist()]  # squared
-        return Rays(rows=rows, cosines=[math.sqrt(1.0 - sine) for sine in sines])
+        square, steepest, squares = height * height, math.sin(fan.steepest) ** 2, self._squares
+        cosines = [math.sqrt(1.0 - min(square / squares[row], steepest)) for row in rows.tolist()]
+        return Rays(rows=rows, cosines=cosines[1:-1])

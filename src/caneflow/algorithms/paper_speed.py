@@ -124,10 +124,10 @@ class PaperSpeed:
     def _push(self, returns: MovingReturns) -> None:
         if returns.restarted:
             self._start_anew(returns.scans.shape[1], returns.parameters)
-        for row, (scan, stamp_ns) in enumerate(zip(returns.scans, returns.stamps_ns, strict=True)):
+        for scan in returns.scans:
             self._window.push(scan)
-            self._stamps_ns.append(stamp_ns)
-            self._stand_ins.append(row < returns.lost)
+        self._stamps_ns.extend(returns.stamps_ns)
+        self._stand_ins.extend(row < returns.lost for row in range(len(returns.stamps_ns)))
 
     def _start_anew(self, bins: int, parameters: RadarParameters) -> None:
         self._window = SlowTimeWindow(length=self._settings.window, bins=bins)

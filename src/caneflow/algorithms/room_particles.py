@@ -65,7 +65,7 @@ class RoomParticleSettings:
     turn_noise: Annotated[float, Gt(0)] = 1.0  # rad/sqrt(s), of a heading that nobody measures
     edge_share: Annotated[float, Ge(0)] = 0.5  # 1/m^2: how fast it becomes unlikely to be outside of the area
     consistent: Annotated[float, Gt(0)] = 3.0  # sd: a measurement farther from every particle is discarded
-    roughening: Annotated[float, Ge(0)] = 0.03  # m, after resampling
+    roughening: Annotated[float, Ge(0)] = 0.05  # m, after resampling
     hold_after: Annotated[float, Gt(0)] = 1.0  # s without a valid echo, after which the position is held
     hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
     hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
@@ -197,13 +197,7 @@ class ParticleTracker(_RoomParticles):
 
     def _move(self, stamp_ns: int, dt: float) -> None:
         s, states = self._settings, self._particles.states
-        turned = 0.0
-        if self._heading_known(stamp_ns):
-            assert self._now_ns is not None
-            turned = self._headings.travel(self._now_ns, stamp_ns).turned
-        # who turns by an angle changes their velocity by as much; constant velocity alone would lose them
-        spread = math.hypot(s.walk_noise * math.sqrt(dt), s.turn_speed * turned)
-        states[2:] += spread * self._random.standard_normal((2, states.shape[1]))
+        states[2:] += s.walk_noise * math.sqrt(dt) * self._random.standard_normal((2, states.shape[1]))
         speed = np.maximum(np.sqrt(states[2] ** 2 + states[3] ** 2), 1e-9)
         if speed.max() > s.fastest:
             states[2:] *= np.minimum(1.0, s.fastest / speed)
