@@ -1,5 +1,6 @@
-"""The room's trackers on a person whose every measurement is known: errors, silence, standing still, cost, real ranges."""
+"""The room's trackers on a person whose every measurement is known: errors, silence, standing still, real ranges."""
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -56,7 +57,11 @@ def echo_at(sensor: StaticSensor, at: float, stamp_ns: int, random: np.random.Ge
     assert sensor.k is not None
     strength = 10.0 * math.log10(sensor.k / distance**4) - pattern_loss(off) + 3.0 * random.standard_normal()
     return Echo(
-        stamp_ns=stamp_ns, valid=abs(rate) > 0.05, range_rate=rate if signed else abs(rate), signed=signed, strength=strength
+        stamp_ns=stamp_ns,
+        valid=abs(rate) > 0.05,
+        range_rate=rate if signed else abs(rate),
+        signed=signed,
+        strength=strength,
     )
 
 
@@ -287,7 +292,9 @@ def test_a_real_person_on_a_triangle_is_followed_by_range() -> None:
     sensors = {node: StaticSensor(position=position, azimuth=0.0) for node, position in NODES.items()}
     settings = RoomEkfSettings(use_speed=False, range_error=0.15)
     tracker = RoomEkf(settings, sensors, RoomStart(guess=(1.0, -1.0), error=0.3))
-    told = sorted((int(t), node, r) for node, (times, ranges) in seen.items() for t, r in zip(times, ranges, strict=True))
+    told = sorted(
+        (int(t), node, r) for node, (times, ranges) in seen.items() for t, r in zip(times, ranges, strict=True)
+    )
     track = []
     for at, node, measured in told:
         there = math.isfinite(measured)
@@ -302,4 +309,4 @@ def distance_to_triangle(point: np.ndarray) -> float:
         along = float(np.clip((point - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0))
         return float(np.linalg.norm(point - a - along * (b - a)))
 
-    return min(to(a, b) for a, b in zip(TRIANGLE[:-1], TRIANGLE[1:], strict=True))
+    return min(to(a, b) for a, b in itertools.pairwise(TRIANGLE))
