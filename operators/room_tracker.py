@@ -33,6 +33,11 @@ SLOWEST_TO_FACE = 0.2  # m/s; without an IMU a slower velocity does not tell whi
 FLOOR_VARIANCE = 1e-6  # m^2 and m^2/s^2, of the height: the person is on the floor
 
 
+def plain() -> RoomEkfSettings:
+    """The filter that takes the strength at its word: no state for what is slowly wrong with it."""
+    return RoomEkfSettings(bias_error=0.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RoomTrackerSettings:
     """Which method, what each may be told, and how the IMU is worn."""
@@ -45,7 +50,7 @@ class RoomTrackerSettings:
     silent_after: Annotated[float, Gt(0)] = 0.5  # s without a sample, after which a sensor counts as silent
     particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
     heading_particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
-    ekf: RoomEkfSettings = field(default_factory=RoomEkfSettings)
+    ekf: RoomEkfSettings = field(default_factory=plain)
     best: RoomEkfSettings = field(default_factory=RoomEkfSettings)
 
 

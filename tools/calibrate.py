@@ -150,7 +150,7 @@ def calibrated(
     for walk, start in zip(walks, starts, strict=True):
         hops = hops_of(walk, name, floor)
         distance, off = _sight(walk, sensor, hops, start, settings)
-        counts = hops.valid & (np.abs(off) <= settings.off_axis)
+        counts = hops.valid & (np.abs(off) <= settings.off_axis) & (np.abs(hops.range_rates) >= settings.least_rate)
         amplitudes.append(hops.amplitudes[counts])
         ranges.append(distance[counts])
     found = range_calibration(np.concatenate(amplitudes), np.concatenate(ranges), settings)

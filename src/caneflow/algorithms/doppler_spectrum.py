@@ -20,6 +20,7 @@ SMOOTHING = 0.95  # per hop, of the spectrum whose minimum is taken: 1 s at the 
 FLOOR_BIAS = 0.565  # that minimum over 20 s of white noise, relative to its mean; a test simulates it
 QUARTILE = 0.288  # lower quartile of one spectrum of white noise, relative to its mean: ln(4/3)
 SETTLING = 20  # spectra before the first minimum is taken
+REFRESH = 4  # spectra between two looks at the minima
 PARTS = 8  # of the memory; the oldest is forgotten as a whole
 BROAD = 21  # bins, 40 Hz; a line fills 4
 SMEAR = 30.0  # over the lower quartile of the floor, 15 dB: as much as 1/f noise may rise at the low end
@@ -158,13 +159,15 @@ class NoiseFloor:
     """Per bin the minimum of the smoothed power over the last `memory` spectra.
 
     Somebody who walks for long at one speed leaves a broad rise, which is taken off. Until there has been time for a
-    minimum, a line that stands would be taken for noise; so at first no bin's floor is above the quieter bins'.
+    minimum, a line that stands would be taken for noise; so at first no floor is further above the quieter bins' than
+    1/f noise may be.
     """
 
     def __init__(self, memory: int) -> None:
         self._part = max(memory // PARTS, SETTLING)  # spectra per part
         self._minima: deque[NDArray[np.float64]] = deque(maxlen=PARTS)
         self._smooth: NDArray[np.float64] | None = None
+        self._floor: NDArray[np.float64] | None = None
         self._count = 0
 
     def update(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,23 +178,34 @@ class NoiseFloor:
         else:  # at first the plain mean: a single spectrum has zeros
             self._smooth += max(1.0 - SMOOTHING, 1.0 / self._count) * (power - self._smooth)
         if self._count <= SETTLING:
-            return self._raised(np.full_like(power, np.quantile(power, 0.25) / QUARTILE))
+            highest = SMEAR * _lower_quartile(power) / QUARTILE
+            return self._raised(np.minimum(self._smooth, highest))
         if (self._count - SETTLING - 1) % self._part == 0:
             self._minima.append(self._smooth.copy())
         else:
             np.minimum(self._minima[-1], self._smooth, out=self._minima[-1])
+        if self._count % REFRESH == 0 or self._floor is None:
+            self._floor = self._found()
+        return self._floor
+
+    def _found(self) -> NDArray[np.float64]:
         floor = np.asarray(np.min(self._minima, axis=0), dtype=np.float64) / FLOOR_BIAS
         if self._count <= self._part:
-            np.minimum(floor, np.quantile(floor, 0.25), out=floor)
+            np.minimum(floor, SMEAR * _lower_quartile(floor), out=floor)
         return self._raised(self._without_smear(floor))
 
     @staticmethod
     def _without_smear(floor: NDArray[np.float64]) -> NDArray[np.float64]:
         """What is both broad and far above the quiet bins is a person who walked on and on; hum is narrow."""
         broad = ndimage.median_filter(floor, size=BROAD, mode="nearest")
-        highest = SMEAR * np.quantile(floor, 0.25)
+        highest = SMEAR * _lower_quartile(floor)
         return np.asarray(floor * np.minimum(1.0, highest / broad), dtype=np.float64)
 
     @staticmethod
     def _raised(floor: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.maximum(floor, LEAST_POWER)
+
+
+def _lower_quartile(values: NDArray[np.float64]) -> float:
+    at = len(values) // 4
+    return float(np.partition(values, at)[at])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Gt
+from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from caneflow.algorithms.room_tracking import StaticSensor
@@ -25,6 +25,7 @@ class CalibrationSettings:
     nearest: Annotated[float, Gt(0)] = 3.0  # m
     farthest: Annotated[float, Gt(0)] = 10.0  # m
     off_axis: Annotated[float, Gt(0)] = math.radians(15.0)  # rad, to either side of the boresight
+    least_rate: Annotated[float, Ge(0)] = 0.35  # m/s along the beam: who crosses it shows another side
     least_hops: Annotated[int, Gt(0)] = 50
     turning_share: Annotated[float, Gt(0)] = 0.35  # of the usual speed, below which the person turns
     turning_time: Annotated[float, Gt(0)] = 1.0  # s, least time between two turns

@@ -66,7 +66,7 @@ class RoomEkfSettings:
     edge_error: Annotated[float, Gt(0)] = 1.0  # m, sd of how far beyond the area's edge somebody may be
     degrees: Annotated[float, Gt(2)] = 4.0  # of freedom of the Student-t that all errors are taken to have
     gate: Annotated[float, Gt(1)] = 5.0  # sd beyond which a measurement is discarded
-    hold_after: Annotated[float, Gt(0)] = 1.0  # s without a valid echo, after which the position is held
+    hold_after: Annotated[float, Gt(0)] = 0.7  # s with hardly a valid echo, after which the position is held
     hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
     hold_speed: Annotated[float, Ge(0)] = 0.3  # m/s, sd of each component of the velocity then
     hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then

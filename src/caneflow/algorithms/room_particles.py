@@ -49,7 +49,6 @@ class RoomParticleSettings:
     particles: ParticleSettings = field(default_factory=ParticleSettings)
     walk_noise: Annotated[float, Gt(0)] = 1.0  # m/s/sqrt(s), on each axis
     along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), of the speed along the heading
-    turn_speed: Annotated[float, Ge(0)] = 1.0  # m/s, of noise per rad that the IMU has turned: it errs so
     fastest: Annotated[float, Gt(0)] = 2.0  # m/s
     start_speed: Annotated[float, Ge(0)] = 0.7  # m/s, sd of each component
     speed_error: Annotated[float, Gt(0)] = 0.12  # m/s
@@ -66,7 +65,7 @@ class RoomParticleSettings:
     edge_share: Annotated[float, Ge(0)] = 0.5  # 1/m^2: how fast it becomes unlikely to be outside of the area
     consistent: Annotated[float, Gt(0)] = 3.0  # sd: a measurement farther from every particle is discarded
     roughening: Annotated[float, Ge(0)] = 0.05  # m, after resampling
-    hold_after: Annotated[float, Gt(0)] = 1.0  # s without a valid echo, after which the position is held
+    hold_after: Annotated[float, Gt(0)] = 0.7  # s with hardly a valid echo, after which the position is held
     hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
     hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
     heading_timeout: Annotated[float, Gt(0)] = 0.5  # s, after which the IMU counts as silent
@@ -108,8 +107,6 @@ class _RoomParticles(ABC):
         self._advance(echo.stamp_ns)
         if echo.valid:
             self._weigh(self._sensors[sensor], echo)
-            if self._particles.renew(self._random):
-                self._roughen()
 
     @abstractmethod
     def estimate(self, stamp_ns: int) -> RoomEstimate:
@@ -139,6 +136,8 @@ class _RoomParticles(ABC):
             self._now_ns = stamp_ns
         if stamp_ns <= self._now_ns:
             return
+        if self._particles.renew(self._random):  # once all that was seen at one time has been weighed
+            self._roughen()
         dt = (stamp_ns - self._now_ns) * 1e-9
         if self._silence.moving(stamp_ns):
             self._move(stamp_ns, dt)

@@ -168,20 +168,32 @@ class HeadingHistory:
 
 
 class SilenceWatch:
-    """Which sensors are there, and whether any of them sees something move (room.md row 11)."""
+    """Whether the sensors see something move (room.md row 11): a single echo may be noise, a share of them is not."""
 
-    def __init__(self, hold: float) -> None:
-        self._hold_ns = round(hold * 1e9)
-        self._seen_ns: int | None = None  # when any sensor last saw something move
+    LEAST_SHARE = 0.06  # of all sensors' echoes; noise alone makes 0.01 to 0.05 of them valid
+
+    def __init__(self, memory: float) -> None:
+        self._memory_ns = round(memory * 1e9)
+        self._echoes: deque[tuple[int, bool]] = deque()
+        self._valid = 0  # of them
+        self._begin_ns: int | None = None
 
     def update(self, stamp_ns: int, valid: bool) -> None:
         """Take whether a sensor sees something move."""
-        if valid or self._seen_ns is None:
-            self._seen_ns = stamp_ns
+        if self._begin_ns is None:
+            self._begin_ns = stamp_ns
+        self._echoes.append((stamp_ns, valid))
+        self._valid += valid
+        while self._echoes[0][0] < stamp_ns - self._memory_ns:
+            self._valid -= self._echoes.popleft()[1]
 
     def moving(self, stamp_ns: int) -> bool:
-        """Whether some sensor has seen something move not long before; true before the first echo."""
-        return self._seen_ns is None or stamp_ns - self._seen_ns <= self._hold_ns
+        """Whether enough of the last echoes were valid; true until there has been time to tell."""
+        if self._begin_ns is None or stamp_ns - self._begin_ns < self._memory_ns:
+            return True
+        if stamp_ns - self._echoes[-1][0] > self._memory_ns:
+            return False
+        return self._valid > self.LEAST_SHARE * len(self._echoes)
 
 
 def pattern_loss(azimuth_off: float) -> float:
