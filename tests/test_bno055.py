@@ -367,8 +367,8 @@ def test_i2c_reads_the_same_and_survives_a_bus_that_does_not_acknowledge() -> No
 
 def test_set_up_from_any_state() -> None:
     wanted = Setup(mode=Mode.IMU, axes=axes("-y+x+z"), external_crystal=True, profile=PROFILE)
-    made = world()
     for before in (None, Setup(), wanted):
+        made = world()
         if before is not None:
             made.chip.set_up(before)
         made.chip.set_up(wanted)
@@ -377,9 +377,10 @@ def test_set_up_from_any_state() -> None:
         assert made.link.read(Register.AXIS_MAP, 2).data == b"\x21\x04"
         assert made.link.read(Register.TRIGGER, 1).data == b"\x80"
         made.pause(0.1)
+        made.chip.read(WHOLE)
         assert str(made.chip.state()) == "fusion runs, mode IMU"
         assert made.chip.profile() == PROFILE
-    assert str(made.chip.state()) == "idle, mode CONFIG"  # where telling the profile leaves it
+        assert str(made.chip.state()) == "idle, mode CONFIG"  # where telling the profile leaves it
 
 
 def test_a_chip_says_who_it_is() -> None:

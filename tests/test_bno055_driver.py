@@ -217,15 +217,47 @@ def test_a_chip_that_resets_itself_is_set_up_anew(source: Any, caplog: pytest.Lo
     assert any("tries again" in message for message in caplog.messages)
 
 
-def test_a_chip_whose_values_stand_still_is_not_believed(source: Any, caplog: pytest.LogCaptureFixture) -> None:
-    on = desk(motion(1200), Faults(freezes=((2.0, 6.0),)))
-    got = samples_of(brought(source(on), on, 11.0))
+def test_values_that_stand_still_are_not_believed(source: Any, caplog: pytest.LogCaptureFixture) -> None:
+    on = desk(motion(1200), Faults(freezes=((2.0, 2.5),)))
+    got = samples_of(brought(source(on), on, 6.5))
     begin = on.emulator.begin
     assert begin is not None
-    false = [time for time, _ in got if begin + 2.02 < time < begin + 7.98]
+    false = [time for time, _ in got if begin + 2.02 < time < begin + 4.48]
     assert max(false) < begin + 3.2, "for a second they might be true"
-    assert min(time for time, _ in got if time > begin + 8.0) < begin + 8.3
+    assert min(time for time, _ in got if time > begin + 4.5) < begin + 4.6
     assert any("the values stand still" in message for message in caplog.messages)
+
+
+def test_a_hung_fusion_is_reset(source: Any) -> None:
+    on = desk(motion(1200), Faults(freezes=((2.0, 100.0),)))
+    got = samples_of(brought(source(on), on, 9.0))
+    begin = on.emulator.begin
+    assert begin is not None
+    back = min(time for time, _ in got if time > begin + 3.2)
+    assert back < begin + driver.REVIVAL_PERIOD + 1.5  # counted from the set-up, and the reset's time
+    assert len([time for time, _ in got if time > back]) > 90 * (9.0 - back)
+
+
+def test_a_silent_chip_gets_its_port_opened_anew(source: Any) -> None:
+    on = desk(motion(800), Faults(silences=((2.0, 1.5),)))
+    got = samples_of(brought(source(on), on, 5.0))
+    begin = on.emulator.begin
+    assert begin is not None
+    assert min(time for time, _ in got if time > begin + 2.1) < begin + 3.5 + 0.3
+    assert on.opened >= 2
+
+
+def test_a_chip_that_was_switched_off_by_others_is_set_up_anew(source: Any) -> None:
+    on = desk(motion(800))
+    times = []
+    with closing(source(on).samples()) as samples:
+        for item in takewhile(lambda _: on.time < 5.0, samples):
+            if not isinstance(item, Quiet):
+                times.append(on.time)
+                if len(times) == 200:
+                    UartLink(on, on.pause, on.now_ns).write(Register.MODE, b"\0")
+    gap = max(b - a for a, b in pairwise(times))
+    assert 0.2 < gap < 0.8
 
 
 def test_short_answers_and_overruns_cost_no_sample(source: Any) -> None:

@@ -121,7 +121,7 @@ def test_live_is_what_was_recorded_and_survives_the_cable(
     port, out, file = tmp_path / "tty", tmp_path / "out.mcap", tmp_path / "flow.yaml"
     flow = "t" + re.sub(r"\W", "", tmp_path.name).lower()[-40:]
     file.write_text(FLOW.format(flow=flow, port=port, folder=tmp_path))
-    emulator = start("emulate", "bno055", walk, "--port", port, "--overruns", 0.02, "--unplug", "3:1")
+    emulator = start("emulate", "bno055", walk, "--port", port, "--overruns", 0.02, "--unplug", "2:1")
     wait_for(port.exists, "the port")
     flow_process = start("run", file, "--record", out)
     driver = driver_of(flow_process.pid)

@@ -55,7 +55,9 @@ def bno055(
     short: Annotated[float, typer.Option(min=0, max=1, help="Part of the answers that end too early.")] = 0.0,
     freeze: Annotated[
         list[str] | None,
-        typer.Option(metavar="AT:FOR", help="From AT, for FOR s, the values stand still (may be given again)."),
+        typer.Option(
+            metavar="AT:FOR", help="From AT, for FOR s or until a reset, values stand still (may be given again)."
+        ),
     ] = None,
     silence: Annotated[
         list[str] | None, typer.Option(metavar="AT:FOR", help="From AT, for FOR s, it does not answer (likewise).")

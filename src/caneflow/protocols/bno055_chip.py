@@ -104,10 +104,10 @@ class Chip:
 
     def set_up(self, setup: Setup) -> None:
         """Make the chip work as wanted, from whatever state; its fusion begins anew."""
-        if setup.profile is not None and self._mode() != Mode.CONFIG:
+        self.link.write(Register.PAGE_ID, b"\0")
+        if setup.profile is not None and not self._is_fresh():
             self.reset()  # a fusion that has run does not take a profile (Bosch's moderator)
         self.change_mode(Mode.CONFIG)
-        self.link.write(Register.PAGE_ID, b"\0")
         self.link.write(Register.POWER, bytes([bno055.POWER_NORMAL]))
         self._choose_clock(external=setup.external_crystal)
         self.link.write(Register.UNITS, bytes([bno055.UNITS_SI]))
@@ -133,6 +133,7 @@ class Chip:
 
     def reset(self) -> None:
         """Reset, and wait until the chip has started."""
+        self.change_mode(Mode.CONFIG)  # the trigger is not among the few registers that can be written elsewhere
         self.link.write_unanswered(Register.TRIGGER, bytes([bno055.TRIGGER_RESET]))
         self._pause(bno055.RESET)
         self._wait_until(self._answers, bno055.RESET, "does not come back from its reset")
@@ -148,6 +149,10 @@ class Chip:
         self.link.write(Register.TRIGGER, bytes([wanted]))
         self._pause(CLOCK_STATUS_AFTER)
         self._wait_until(self._clock_is_free, CLOCK_PATIENCE, "its clock stays in change; has it the crystal?")
+
+    def _is_fresh(self) -> bool:
+        """Whether the fusion has not run since the chip started: then it has learnt nothing."""
+        return self._mode() == Mode.CONFIG and not any(self._read(Register.PROFILE, PROFILE_BYTES))
 
     def _answers(self) -> bool:
         return self._read(Register.CHIP_ID, 1)[0] == bno055.CHIP_ID

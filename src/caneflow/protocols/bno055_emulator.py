@@ -68,7 +68,7 @@ class Faults:
 
     overruns: float = 0.0  # part of all requests that are answered by EE 07
     short: float = 0.0  # part of all answers that end before their last bytes
-    freezes: tuple[Span, ...] = ()  # the values stand still
+    freezes: tuple[Span, ...] = ()  # the values stand still, unless there is a reset
     silences: tuple[Span, ...] = ()  # no answer
     resets: tuple[float, ...] = ()  # the chip starts anew by itself
 
@@ -153,6 +153,8 @@ class Emulator:
         self._busy_until = now + takes  # hears, and has no time
         self._clock_free_at = now
         self._fusion_at: float | None = None
+        self._has_fused = False
+        self._started_at = now
         self._request = bytearray()
         self._answers: deque[tuple[float, bytes]] = deque()
         self._wire_free_at = now
@@ -241,6 +243,8 @@ class Emulator:
             self.begin = self._fusion_at
         assert self.begin is not None
         frozen = self._within(self._faults.freezes, now)
+        if frozen is not None and self.begin + frozen < self._started_at:
+            frozen = None
         index = self._motion.index(now - self.begin if frozen is None else frozen)
         if index < 0:
             return NO_VALUES
@@ -266,7 +270,7 @@ class Emulator:
             elif self._page == 0 and address == Register.TRIGGER and value & bno055.TRIGGER_RESET:
                 self._start(now, bno055.RESET)
                 return None
-            else:
+            elif not (address in PROFILE_REGISTERS and self._has_fused):  # Bosch advises against it: assumed
                 self._pages[self._page][address] = value
                 if self._page == 0 and address == Register.TRIGGER:
                     self._clock_free_at = now + CLOCK_CHANGE
@@ -294,6 +298,7 @@ class Emulator:
         else:
             self._busy_until = now + bno055.FROM_CONFIG
             self._fusion_at = self._busy_until + FUSION_START
+            self._has_fused = True
 
     def _within(self, spans: Sequence[Span], now: float) -> float | None:
         """The beginning of the span in which `now` lies, s of the motion; None: it lies in none."""
