@@ -48,12 +48,12 @@ class Fusion(Operator):
         self._cane_filter = self._estimator if isinstance(self._estimator, CaneFilter) else None
 
     def handle(self, port: str, message: Sample) -> Emitted:
-        """Yield the pose at an IMU sample's stamp; a speed only informs the estimator."""
-        match message:
-            case GroundSpeed():
-                self._take_speed(message)
-            case Imu():
-                yield "pose", self._pose(message)
+        """The pose at an IMU sample's stamp; a speed only informs the estimator."""
+        if isinstance(message, Imu):
+            return (("pose", self._pose(message)),)
+        if isinstance(message, GroundSpeed):
+            self._take_speed(message)
+        return ()
 
     def _take_speed(self, ground: GroundSpeed) -> None:
         if self._cane_filter is not None and ground.velocity is not None and ground.velocity_cov is not None:

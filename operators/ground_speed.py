@@ -6,7 +6,8 @@ out  speed : GroundSpeed  one per frame
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from operator import attrgetter
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
 from caneflow.algorithms.footprint import CaneGeometry
@@ -18,6 +19,8 @@ from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 
+PARAMETERS = tuple(each.name for each in fields(RadarParameters))  # a frame calls them the same
+DESCRIPTION = attrgetter(*PARAMETERS)
 NO_SPEED = SpeedEstimate(speed=0.0, quality=math.inf, rays=0, valid=False, delay=0.0)  # the paper's front end is off
 
 
@@ -49,14 +52,16 @@ class GroundSpeedOperator(Operator):
         self._paper = PaperSpeed(settings.paper, rig) if settings.with_speed else None
         self._velocity = GroundVelocityEstimator(settings.ground_velocity, rig) if settings.with_velocity else None
         self._attitudes = AttitudeHistory()
+        self._described: tuple[float, ...] = ()  # what the frame before said of its scans
+        self._parameters: RadarParameters | None = None  # the same by name
 
     def handle(self, port: str, message: Sample) -> Emitted:
-        """Yield the speed at a frame's stamp; an IMU sample only tells the attitude."""
-        match message:
-            case Imu():
-                self._take_attitude(message)
-            case RadarFrame():
-                yield "speed", self._speed(message)
+        """The speed at a frame's stamp; an IMU sample only tells the attitude."""
+        if isinstance(message, RadarFrame):
+            return (("speed", self._speed(message)),)
+        if isinstance(message, Imu):
+            self._take_attitude(message)
+        return ()
 
     def _take_attitude(self, imu: Imu) -> None:
         if imu.orientation is None:
@@ -66,15 +71,8 @@ class GroundSpeedOperator(Operator):
             self._velocity.imu(imu.stamp, imu.orientation, imu.accel)
 
     def _speed(self, frame: RadarFrame) -> GroundSpeed:
-        parameters = RadarParameters(
-            scan_period=frame.scan_period,
-            range_start=frame.range_start,
-            range_step=frame.range_step,
-            carrier=frame.carrier,
-            bandwidth=frame.bandwidth,
-        )
         try:
-            returns = self._moving_returns.update(frame.stamp, frame.scans, parameters)
+            returns = self._moving_returns.update(frame.stamp, frame.scans, self._parameters_of(frame))
         except ValueError as error:
             raise Refused(str(error)) from error
         speed = self._paper.update(returns, self._attitudes) if self._paper is not None else NO_SPEED
@@ -90,6 +88,13 @@ class GroundSpeedOperator(Operator):
             velocity_cov=velocity.covariance if velocity is not None else None,
             velocity_delay=velocity.delay if velocity is not None else None,
         )
+
+    def _parameters_of(self, frame: RadarFrame) -> RadarParameters:
+        described = DESCRIPTION(frame)
+        if self._parameters is None or described != self._described:
+            self._described = described
+            self._parameters = RadarParameters(**dict(zip(PARAMETERS, described, strict=True)))
+        return self._parameters
 
 
 def geometry(rig: Rig) -> CaneGeometry:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from caneflow import __version__
+import caneflow
 from caneflow.errors import CaneflowError
 
 TOOLS = "caneflow.tools"
@@ -36,6 +36,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "emulate": ("emulate", "Play a device from a recording, for a driver to talk to."),
     "eval": ("evaluate", "Compare methods over recordings with ground truth."),
     "experiments": ("experiments", "Make the paper's experiments on simulated walks."),
+    "bench": ("bench", "Measure how fast a recording runs, and where the time goes."),
     "calibrate": ("calibrate", "Fit the rig to recordings."),
     "plot": ("plot", "Draw a recording's track and speed."),
     "view": ("view", "Show a running flow in the browser."),
@@ -95,7 +96,7 @@ def _command() -> TyperGroup:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"caneflow {__version__}")
+        print(f"caneflow {caneflow.__version__}")
         raise typer.Exit
 
 

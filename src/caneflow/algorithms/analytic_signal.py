@@ -37,13 +37,24 @@ class AnalyticSignal:
                 f"every {range_step:.4g} m: they hold 0..{frequencies[-1]:.4g} Hz"
             )
         self._first, self._end = int(inside.argmax()), int(np.flatnonzero(inside)[-1]) + 1  # lines of the band
-        self._bins = bins
+        self._gain = 2 * bins
+        self._shape: tuple[int, ...] = ()  # of the scans that the buffers are made for
 
     def __call__(self, scans: NDArray[np.number]) -> NDArray[np.complex64]:
         """The analytic signals of real `scans`, shape (..., bins); same shape."""
+        if scans.shape != self._shape:
+            self._make_buffers(scans.shape)
         # Without a factor of its own (norm="backward") numpy would transform forward in double precision.
-        one_sided = np.fft.rfft(scans.astype(np.float32), norm="forward")
-        spectrum = np.zeros(scans.shape, np.complex64)
-        band = slice(self._first, self._end)
-        np.multiply(one_sided[..., band], 2 * self._bins, out=spectrum[..., band])
-        return np.fft.ifft(spectrum).astype(np.complex64, copy=False)  # it is; the stub says complex128
+        np.fft.rfft(scans.astype(np.float32), norm="forward", out=self._one_sided)  # type: ignore[arg-type]  # stubs know double only
+        np.multiply(self._found, self._gain, out=self._kept)
+        signals = np.empty(scans.shape, np.complex64)
+        np.fft.ifft(self._spectrum, out=signals)  # type: ignore[arg-type]
+        return signals
+
+    def _make_buffers(self, shape: tuple[int, ...]) -> None:
+        """Spectra of scans of one shape, one-sided and whole, and the band in both; the rest of the whole stays 0."""
+        self._shape = shape
+        self._one_sided = np.empty((*shape[:-1], shape[-1] // 2 + 1), np.complex64)
+        self._spectrum = np.zeros(shape, np.complex64)
+        self._found = self._one_sided[..., self._first : self._end]
+        self._kept = self._spectrum[..., self._first : self._end]

@@ -80,12 +80,16 @@ class PaperSpeed:
         self._weights = hann(settings.window).astype(np.complex64)  # of the type they scale: no casts
         self._cell = settings.transform / settings.window  # Doppler bins per resolution cell
         self._beyond = settings.edge_beyond_speed * self._cell if settings.compensate_edge else 0.0  # Doppler bins
-        # Slow-time rows to transform; what lies behind the window stays 0.
-        self._padded = np.zeros((settings.rays + 2, settings.transform), np.complex64)
+        # Slow-time rows to transform; what lies behind the window stays 0. numpy takes four rows at a time: any that
+        # are left over cost as much as all four.
+        rows = math.ceil((settings.rays + 2) / 4) * 4
+        self._padded = np.zeros((rows, settings.transform), np.complex64)
+        self._scans = self._padded[: settings.rays + 2, : settings.window]
+        self._spectra = np.empty_like(self._padded)
         self._window = SlowTimeWindow(length=settings.window, bins=0)
         self._caster: RayCaster | None = None
         self._stamps_ns: deque[int] = deque(maxlen=settings.window)
-        self._stand_ins: deque[bool] = deque(maxlen=settings.window)  # which scans of the window were lost
+        self._stand_ins: deque[int] = deque()  # stamps of the window's scans that were lost
 
     def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> SpeedEstimate:
         """The estimate after one more frame.
@@ -100,7 +104,7 @@ class PaperSpeed:
         oldest_ns, newest_ns = self._stamps_ns[0], self._stamps_ns[-1]
         delay = (newest_ns - oldest_ns) * 0.5e-9
         orientation = attitudes.at((oldest_ns + newest_ns) // 2)
-        if orientation is None or self._stand_ins.count(True) > settings.most_lost * settings.window:
+        if orientation is None or len(self._stand_ins) > settings.most_lost * settings.window:
             return _nothing(delay)
         rays = self._rays(orientation)
         if rays is NO_RAYS:
@@ -127,7 +131,9 @@ class PaperSpeed:
         for scan in returns.scans:
             self._window.push(scan)
         self._stamps_ns.extend(returns.stamps_ns)
-        self._stand_ins.extend(row < returns.lost for row in range(len(returns.stamps_ns)))
+        self._stand_ins.extend(returns.stamps_ns[: returns.lost])
+        while self._stand_ins and self._stand_ins[0] < self._stamps_ns[0]:
+            self._stand_ins.popleft()
 
     def _start_anew(self, bins: int, parameters: RadarParameters) -> None:
         self._window = SlowTimeWindow(length=self._settings.window, bins=bins)
@@ -148,9 +154,10 @@ class PaperSpeed:
         One range bin's spectrum is speckle, its steepest fall often that of a chance gap below the fastest ground.
         In sum over three bins, most of a range cell apart, the edge lies where the expected spectrum has it.
         """
-        np.multiply(self._window.rows(rays.rows), self._weights, out=self._padded[:, : self._settings.window])
+        np.multiply(self._window.rows(rays.rows), self._weights, out=self._scans)
         # Power is compared with power only. Without a factor (norm="backward") numpy would go over to double.
-        power: NDArray[np.float32] = np.abs(np.fft.fft(self._padded, norm="forward"))
+        np.fft.fft(self._padded, norm="forward", out=self._spectra)  # type: ignore[arg-type]  # stubs know double only
+        power: NDArray[np.float32] = np.abs(self._spectra[: len(rays.rows)])
         power *= power
         summed = power[:-2] + power[1:-1]
         summed += power[2:]
@@ -185,7 +192,7 @@ class PaperSpeed:
             if edge > last_edge:
                 ambiguous += 1
             else:
-                speeds.append(max(edge - beyond, 0.0) * per_bin / cosine)
+                speeds.append((edge - beyond) * per_bin / cosine if edge > beyond else 0.0)
                 heights.append(fall)
         return ([], []) if 4 * ambiguous > settings.rays else (speeds, heights)
 

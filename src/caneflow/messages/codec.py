@@ -31,7 +31,7 @@ def decode(payload: bytes, kind: type[S]) -> S:
         raise MessageError(f"{len(payload)} bytes; at most {MAX_PAYLOAD} are taken")
     try:
         message: S = _decoder(kind).decode(payload)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MessageError(str(error)) from error
     if isinstance(message, Sample) and message.seq < 0:
         raise MessageError(f"seq is {'missing' if message.seq == -1 else message.seq}; it counts 0, 1, 2 ...")

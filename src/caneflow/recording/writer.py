@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, TypeAlias
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
-from caneflow import __version__
+import caneflow
 from caneflow.messages import Sample, json_schema
 from caneflow.recording.errors import RecordingError
 
@@ -58,7 +58,7 @@ class RecordingWriter:
             raise RecordingError(_cannot_open(self.path, error)) from error
         self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE, compression=COMPRESSIONS[compression])
         with self._ending_at_failure():
-            self._mcap.start(library=f"caneflow {__version__}")
+            self._mcap.start(library=f"caneflow {caneflow.__version__}")
             self._mcap.add_metadata("caneflow", about)
             self._mcap.add_metadata("rig", bolted_on)
             self._flush()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from caneflow import __version__
+import caneflow
 from caneflow.runtime.history import Kept
 from caneflow.runtime.program import Operator
 from caneflow.runtime.snapshot import SnapshotError, pack, unpack
@@ -45,7 +45,7 @@ class SnapshotKeeper:
             self._possible = False
             log.warning("cannot be brought back exactly after a kill: %s", error)
             return
-        snapshot = Snapshot(__version__, self._program, stage, history, state)
+        snapshot = Snapshot(caneflow.__version__, self._program, stage, history, state)
         fresh = self._path.with_suffix(".new")
         fresh.write_bytes(msgspec.msgpack.encode(snapshot))
         fresh.replace(self._path)
@@ -56,7 +56,7 @@ class SnapshotKeeper:
             return None
         try:
             snapshot = msgspec.msgpack.decode(self._path.read_bytes(), type=Snapshot)
-            if (snapshot.version, snapshot.program) != (__version__, self._program):
+            if (snapshot.version, snapshot.program) != (caneflow.__version__, self._program):
                 raise SnapshotError(f"it is of {snapshot.program} of caneflow {snapshot.version}")
             state = unpack(snapshot.operator, self._module)
         except (OSError, msgspec.MsgspecError, SnapshotError) as error:
