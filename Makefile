@@ -33,7 +33,7 @@ lint: $(BIN)/.installed
 # What the pages say of messages and of dataflow.yaml is written from the code.
 docs: $(BIN)/.installed
 	$(BIN)/python -m caneflow.messages.reference docs
-	$(BIN)/python -m caneflow.runtime.yaml_reference docs
+	$(BIN)/python -m caneflow.runtime.dataflow.yaml_reference docs
 
 # The long tests: every shared walk at real time and at full speed, calm and under load.
 soak: $(BIN)/.installed

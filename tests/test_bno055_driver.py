@@ -25,8 +25,8 @@ from caneflow.protocols.bno055 import WHOLE, Measurement, Register, measurement,
 from caneflow.protocols.bno055_emulator import LEARNT, Bench, Emulator, Faults, Motion
 from caneflow.protocols.bno055_link import UartLink
 from caneflow.runtime import Context, Quiet
+from caneflow.runtime.dataflow.programs import validated_settings
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.programs import validated_settings
 from drivers import bno055 as driver
 
 EPOCH = 1_700_000_000_000_000_000  # ns, when the bench's clock began

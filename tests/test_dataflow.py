@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame
-from caneflow.runtime.dataflow import load, read_rig
+from caneflow.runtime.dataflow.graph import Graph, Queue, Restart
+from caneflow.runtime.dataflow.loading import load, read_rig
+from caneflow.runtime.dataflow.programs import validated_settings
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph import Graph, Queue, Restart
-from caneflow.runtime.programs import validated_settings
 
 ROOT = Path(__file__).parents[1]
 
@@ -241,7 +241,9 @@ def test_the_canes_own_graph_is_sound() -> None:
 
 
 def test_the_checks_need_neither_zenoh_nor_scipy() -> None:
-    code = "import sys, caneflow.runtime.dataflow; print({'scipy', 'zenoh', 'typer'} & set(sys.modules) or 'none')"
+    code = (
+        "import sys, caneflow.runtime.dataflow.loading; print({'scipy', 'zenoh', 'typer'} & set(sys.modules) or 'none')"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert done.stdout.strip() == "none"

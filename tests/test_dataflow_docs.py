@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from caneflow.runtime.dataflow import load
-from caneflow.runtime.yaml_reference import TABLES, schema_text, with_tables
-from caneflow.runtime.yaml_shape import yaml_schema
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.dataflow.yaml_reference import TABLES, schema_text, with_tables
+from caneflow.runtime.dataflow.yaml_shape import yaml_schema
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "dataflow.md").read_text(encoding="utf-8")
-ANEW = "; run: python -m caneflow.runtime.yaml_reference docs"
+ANEW = "; run: python -m caneflow.runtime.dataflow.yaml_reference docs"
 
 
 def test_the_schema_file_is_what_the_code_checks_by() -> None:

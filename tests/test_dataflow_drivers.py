@@ -7,9 +7,9 @@ import pytest
 
 from caneflow.messages import Imu, RadarFrame
 from caneflow.messages.rig import Rig
+from caneflow.runtime.dataflow.programs import load_program, validated_settings
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import Context, Source
-from caneflow.runtime.programs import load_program, validated_settings
 
 BIN_PS = 1000 / (512 * 1.024)  # ps: the radar's time grid
 SCAN_STEP = 32  # bins of the grid between two samples of a scan

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from caneflow.runtime.dataflow import examine, load
+from caneflow.runtime.dataflow.loading import examine, load
 
 RELAY = """
 from caneflow.messages import Sample, Imu

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caneflow.runtime.dataflow import examine, load
+from caneflow.runtime.dataflow.loading import examine, load
 from caneflow.runtime.errors import DataflowError
 
 PROGRAM = """

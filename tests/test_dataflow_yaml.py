@@ -9,9 +9,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from caneflow.runtime.dataflow import load
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.dataflow.yaml_file import MAX_BYTES, compose
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.yaml_file import MAX_BYTES, compose
 
 FLOW = """\
 # a comment

@@ -9,7 +9,7 @@ from typer import Exit
 
 from caneflow.algorithms.track_errors import Track
 from caneflow.errors import CaneflowError
-from caneflow.runtime.evaluation import FIGURES, Evaluation
+from caneflow.runtime.replays.evaluation import FIGURES, Evaluation
 from caneflow.simulation.scenario import SCENARIOS
 from tools import experiments, simulate
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caneflow.messages import Imu
-from caneflow.runtime.merge import END, Merge
+from caneflow.runtime.stages.merge import END, Merge
 
 
 def sample(stamp: int) -> Imu:

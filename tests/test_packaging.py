@@ -8,6 +8,6 @@ ROOT = Path(__file__).parents[1]
 
 def test_every_room_is_packaged() -> None:
     packages = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
-    rooms = {f"caneflow.{path.parent.name}" for path in (ROOT / "src" / "caneflow").glob("*/__init__.py")}
+    rooms = {".".join(path.parent.relative_to(ROOT / "src").parts) for path in (ROOT / "src").rglob("__init__.py")}
     programs = {f"caneflow.{room}" for room in ("operators", "drivers", "tools")}
-    assert packages == {"caneflow"} | rooms | programs
+    assert packages == rooms | programs

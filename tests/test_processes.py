@@ -18,8 +18,8 @@ import zenoh
 from caneflow.messages import Imu, RadarFrame, control_key, decode, numbered, sample_key
 from caneflow.messages.control import Counters
 from caneflow.recording import Recording, RecordingWriter
-from caneflow.runtime.links import open_session
-from caneflow.runtime.run_directory import running_flows
+from caneflow.runtime.hosts.links import open_session
+from caneflow.runtime.hosts.run_directory import running_flows
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]

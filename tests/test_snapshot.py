@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caneflow.messages import Imu
-from caneflow.runtime.snapshot import SnapshotError, pack, unpack
+from caneflow.runtime.stages.snapshot import SnapshotError, pack, unpack
 
 
 class Colour(enum.Enum):

@@ -9,9 +9,9 @@ from caneflow.messages import GroundSpeed, Imu, MessageError, Sample
 from caneflow.messages.control import PortMark
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.merge import END
 from caneflow.runtime.plan import InputPlan, OutputPlan
-from caneflow.runtime.stage import Stage
+from caneflow.runtime.stages.merge import END
+from caneflow.runtime.stages.stage import Stage
 
 
 class Echo(Operator):

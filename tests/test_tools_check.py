@@ -11,9 +11,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from caneflow.runtime.dataflow import load
+from caneflow.runtime.dataflow.graph_pictures import as_dot, as_svg
+from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph_pictures import as_dot, as_svg
 from tools import check, graph
 
 FLOW = """\

@@ -15,10 +15,10 @@ import pytest
 from caneflow.algorithms.error_summary import consistent_mean
 from caneflow.messages import Pose
 from caneflow.recording import TRUTH, Recording, RecordingWriter
-from caneflow.runtime.dataflow import load
+from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.evaluation import FIGURES, chosen_methods, estimates, evaluated, offered_methods
 from caneflow.runtime.program import Emitted, Operator
+from caneflow.runtime.replays.evaluation import FIGURES, chosen_methods, estimates, evaluated, offered_methods
 from tools import evaluate, simulate
 
 ROOT = Path(__file__).parents[1]

@@ -15,11 +15,11 @@ import typer
 from caneflow.messages import MessageError, Sample, decode
 from caneflow.recording import Recording
 from caneflow.runtime import Emitted, Operator
-from caneflow.runtime.dataflow import load
+from caneflow.runtime.dataflow.graph import Graph
+from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.deployment import Replay, deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph import Graph
-from caneflow.runtime.in_process import InProcess
+from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.program import Program
 
 clock = time.process_time  # CPU time: other programs on the machine count less

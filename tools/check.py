@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
-from caneflow.runtime.dataflow import examine, read_rig
+from caneflow.runtime.dataflow.graph import Graph
+from caneflow.runtime.dataflow.loading import examine, read_rig
 from caneflow.runtime.errors import Problem
-from caneflow.runtime.graph import Graph
 
 MISTAKEN_STATUS = 1
 

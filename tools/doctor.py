@@ -28,8 +28,8 @@ from caneflow.protocols.bno055_chip import Chip, Identity
 from caneflow.protocols.bno055_link import I2cLink, Link, UartLink
 from caneflow.protocols.errors import ProtocolError
 from caneflow.runtime import Context, Quiet, Source
-from caneflow.runtime.dataflow import load
-from caneflow.runtime.graph import Node
+from caneflow.runtime.dataflow.graph import Node
+from caneflow.runtime.dataflow.loading import load
 
 TROUBLE_STATUS = 1
 PROBE_READS = 50

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.progress import track
 
 from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
-from caneflow.runtime.dataflow import load
-from caneflow.runtime.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.replays.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated
 
 FAILED_STATUS = 1
 

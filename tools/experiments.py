@@ -24,8 +24,8 @@ import caneflow
 from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
 from caneflow.algorithms.track_errors import aligned
 from caneflow.errors import CaneflowError
-from caneflow.runtime.dataflow import load
-from caneflow.runtime.evaluation import Evaluation, chosen_methods, evaluated
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.replays.evaluation import Evaluation, chosen_methods, evaluated
 from caneflow.simulation import scenario as walk_scenarios
 
 Item = TypeVar("Item")

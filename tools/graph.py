@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from caneflow.runtime.dataflow import load
-from caneflow.runtime.graph import Graph
-from caneflow.runtime.graph_pictures import as_data, as_mermaid, as_svg
+from caneflow.runtime.dataflow.graph import Graph
+from caneflow.runtime.dataflow.graph_pictures import as_data, as_mermaid, as_svg
+from caneflow.runtime.dataflow.loading import load
 
 DRAW: dict[str, Callable[[Graph], str]] = {
     "mermaid": as_mermaid,

@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import typer
 
 from caneflow.messages.control import Counters
-from caneflow.runtime.dataflow import load, read_rig
+from caneflow.runtime.dataflow.loading import load, read_rig
 from caneflow.runtime.deployment import Deployment, Replay, deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.in_process import InProcess
-from caneflow.runtime.launch import Launcher, Outcome
+from caneflow.runtime.hosts.in_process import InProcess
+from caneflow.runtime.hosts.launch import Launcher, Outcome
 
 
 def command(

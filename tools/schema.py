@@ -36,7 +36,7 @@ def schemas() -> dict[str, dict[str, Any]]:
 def schema_of(name: str) -> dict[str, Any]:
     """The JSON Schema of `name`: `Imu`, `caneflow.Imu/1` or `dataflow`. Raises CaneflowError for another name."""
     if name == DATAFLOW:
-        from caneflow.runtime.yaml_shape import yaml_schema  # here, as a message's schema needs no runtime
+        from caneflow.runtime.dataflow.yaml_shape import yaml_schema  # here, as a message's schema needs no runtime
 
         return yaml_schema()
     known = schemas()

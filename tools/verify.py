@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from caneflow.runtime.dataflow import load
-from caneflow.runtime.verification import Verdict, verify
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.replays.verification import Verdict, verify
 
 
 def command(

@@ -12,9 +12,9 @@ from caneflow.messages import Sample, control_key, decode, sample_key
 from caneflow.messages.control import LeftOut
 from caneflow.messages.rig import overlaid, read_rig
 from caneflow.recording import Recording
+from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph import Graph, Node
-from caneflow.runtime.links import Ports
+from caneflow.runtime.hosts.links import Ports
 from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
 
 LeftOutStamps: TypeAlias = dict[tuple[str, str], set[int]]

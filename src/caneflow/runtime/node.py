@@ -20,7 +20,8 @@ from caneflow.errors import CaneflowError
 from caneflow.messages import MessageError, Sample, decode, numbered
 from caneflow.messages.control import Again, Counters, Progress
 from caneflow.messages.rig import read_rig
-from caneflow.runtime.bus import (
+from caneflow.runtime.dataflow.programs import validated_settings
+from caneflow.runtime.hosts.bus import (
     Answered,
     Arrived,
     Asked,
@@ -34,16 +35,15 @@ from caneflow.runtime.bus import (
     Stopped,
     check_schema,
 )
-from caneflow.runtime.feed import Feed
-from caneflow.runtime.history import History
-from caneflow.runtime.merge import BEGIN, END
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Operator, Program, Quiet, Sink, Source
-from caneflow.runtime.programs import validated_settings
-from caneflow.runtime.seeds import generator
-from caneflow.runtime.snapshot_keeper import SnapshotKeeper
-from caneflow.runtime.stage import Stage
-from caneflow.runtime.tap import Tap
+from caneflow.runtime.stages.feed import Feed
+from caneflow.runtime.stages.history import History
+from caneflow.runtime.stages.merge import BEGIN, END
+from caneflow.runtime.stages.seeds import generator
+from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
+from caneflow.runtime.stages.stage import Stage
+from caneflow.runtime.stages.tap import Tap
 
 log = logging.getLogger(__name__)
 

@@ -16,9 +16,9 @@ from types import CodeType, ModuleType
 from typing import Any, NamedTuple
 
 from caneflow.messages import NAME, NAME_RULE, Sample
+from caneflow.runtime.dataflow.validation import Checked, Mistake
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import ANY_PORT, Operator, Program, Sink, Source
-from caneflow.runtime.validation import Checked, Mistake
 from caneflow.runtime.wording import did_you_mean, dotted, listed, one_line, shown
 
 ROOMS = ("drivers", "operators")

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from caneflow.messages import MessageError, Sample, decode, numbered
 from caneflow.messages.control import PortMark, Progress
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.merge import BEGIN, END
 from caneflow.runtime.plan import OutputPlan
 from caneflow.runtime.program import Encoded
-from caneflow.runtime.streams import Departures
+from caneflow.runtime.stages.merge import BEGIN, END
+from caneflow.runtime.stages.streams import Departures
 
 log = logging.getLogger(__name__)
 

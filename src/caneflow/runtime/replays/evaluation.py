@@ -21,14 +21,14 @@ from caneflow.errors import CaneflowError
 from caneflow.messages import Pose, Sample
 from caneflow.messages.rig import Rig, overlaid
 from caneflow.recording import TRUTH, Recording
-from caneflow.runtime.dataflow import load
+from caneflow.runtime.dataflow.graph import Graph, Node, Queue, Wire
+from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.deployment import Replay, deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph import Graph, Node, Queue, Wire
-from caneflow.runtime.in_process import InProcess
+from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.program import Sink
+from caneflow.runtime.replays.workers import mapped
 from caneflow.runtime.wording import did_you_mean, listed, one_line
-from caneflow.runtime.workers import mapped
 
 ESTIMATOR = "fusion"  # the node whose methods are compared
 METHOD = "method"  # its setting that selects one

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from caneflow.runtime import guard
+from caneflow.runtime.hosts import guard
 
 # One thread for linear algebra in each process: the flow is parallel already, and sums must not depend on cores.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

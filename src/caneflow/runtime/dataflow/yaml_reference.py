@@ -1,6 +1,6 @@
 """The reference of dataflow.yaml, written from its types: JSON Schema for editors, tables for docs/dataflow.md.
 
-`python -m caneflow.runtime.yaml_reference docs` writes both anew.
+`python -m caneflow.runtime.dataflow.yaml_reference docs` writes both anew.
 """
 
 import json
@@ -12,8 +12,15 @@ from typing import Any
 from pydantic import BaseModel
 
 from caneflow.messages.rig import Rig, Sensor, Start
-from caneflow.runtime.validation import Checked
-from caneflow.runtime.yaml_shape import FlowShape, InputShape, MachineShape, NodeShape, RestartShape, yaml_schema
+from caneflow.runtime.dataflow.validation import Checked
+from caneflow.runtime.dataflow.yaml_shape import (
+    FlowShape,
+    InputShape,
+    MachineShape,
+    NodeShape,
+    RestartShape,
+    yaml_schema,
+)
 
 TABLES: dict[str, type[BaseModel]] = {
     "flow": FlowShape,

@@ -11,10 +11,10 @@ import msgspec
 from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, LeftOut, PortMark, Progress
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.merge import END, Merge
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.program import Operator, Refused
-from caneflow.runtime.streams import Arrivals, Departures
+from caneflow.runtime.stages.merge import END, Merge
+from caneflow.runtime.stages.streams import Arrivals, Departures
 
 
 class StageState(msgspec.Struct, frozen=True):

@@ -11,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSche
 
 from caneflow.messages import NAME, NAME_RULE
 from caneflow.messages.rig import Rig
-from caneflow.runtime.validation import Checked, Mistake, is_inside
+from caneflow.runtime.dataflow.validation import Checked, Mistake, is_inside
 from caneflow.runtime.wording import KeyPath
 
 NAME_PATTERN = f"^{NAME.pattern}$"

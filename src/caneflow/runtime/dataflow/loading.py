@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from caneflow.messages.rig import Rig
+from caneflow.runtime.dataflow.graph import Graph, Machine, Node, Restart
+from caneflow.runtime.dataflow.programs import check_settings, load_program, locate, outputs_of
+from caneflow.runtime.dataflow.topology import check_machines
+from caneflow.runtime.dataflow.validation import Checked
+from caneflow.runtime.dataflow.wiring import Part, check_wires, external_outputs, warn_of_unread
+from caneflow.runtime.dataflow.yaml_file import MAX_DEPTH, Document, compose, read_yaml
+from caneflow.runtime.dataflow.yaml_shape import FlowShape, NodeShape, RestartShape, is_written, read_shape
 from caneflow.runtime.errors import DataflowError, Place, Problem
-from caneflow.runtime.graph import Graph, Machine, Node, Restart
-from caneflow.runtime.programs import check_settings, load_program, locate, outputs_of
-from caneflow.runtime.topology import check_machines
-from caneflow.runtime.validation import Checked
-from caneflow.runtime.wiring import Part, check_wires, external_outputs, warn_of_unread
 from caneflow.runtime.wording import did_you_mean, listed, one_line, shown
-from caneflow.runtime.yaml_file import MAX_DEPTH, Document, compose, read_yaml
-from caneflow.runtime.yaml_shape import FlowShape, NodeShape, RestartShape, is_written, read_shape
 
 GIVEN_RIG = "rig of the recording or --rig"
 NOT_FOR_EXTERNAL = ("run", "inputs", "settings", "restart", "ready_timeout_s")

@@ -5,8 +5,8 @@ import subprocess
 from typing import Any
 
 from caneflow.messages import Sample
+from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph import Graph, Node
 
 DOT_PATIENCE = 60  # s that Graphviz has
 

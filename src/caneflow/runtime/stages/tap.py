@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, PortMark, Progress
-from caneflow.runtime.merge import BEGIN, END
 from caneflow.runtime.plan import InputPlan
 from caneflow.runtime.program import Sink
-from caneflow.runtime.streams import Arrivals
+from caneflow.runtime.stages.merge import BEGIN, END
+from caneflow.runtime.stages.streams import Arrivals
 
 
 class Tap:

@@ -7,10 +7,10 @@ from pathlib import Path
 import msgspec
 
 import caneflow
-from caneflow.runtime.history import Kept
 from caneflow.runtime.program import Operator
-from caneflow.runtime.snapshot import SnapshotError, pack, unpack
-from caneflow.runtime.stage import StageState
+from caneflow.runtime.stages.history import Kept
+from caneflow.runtime.stages.snapshot import SnapshotError, pack, unpack
+from caneflow.runtime.stages.stage import StageState
 
 log = logging.getLogger(__name__)
 

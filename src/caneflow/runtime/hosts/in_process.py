@@ -14,13 +14,13 @@ from caneflow.messages import MessageError, Sample, decode, encode, with_number
 from caneflow.messages.control import Counters
 from caneflow.runtime.deployment import RECORDER_MODULE, REPLAYER_MODULE, Deployment
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.feed import Feed
-from caneflow.runtime.launch import Outcome, note_losses
+from caneflow.runtime.hosts.launch import Outcome, note_losses
 from caneflow.runtime.node import build
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source
-from caneflow.runtime.stage import Stage
-from caneflow.runtime.tap import Tap
+from caneflow.runtime.stages.feed import Feed
+from caneflow.runtime.stages.stage import Stage
+from caneflow.runtime.stages.tap import Tap
 
 Arriving: TypeAlias = tuple[str, str, Sample | Encoded]  # node, port, sample
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, LeftOut, PortMark
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.merge import BEGIN
 from caneflow.runtime.plan import InputPlan, OutputPlan
+from caneflow.runtime.stages.merge import BEGIN
 
 log = logging.getLogger(__name__)
 

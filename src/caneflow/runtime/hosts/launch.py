@@ -13,13 +13,13 @@ import zenoh
 
 from caneflow.messages import MessageError, control_key, decode, encode
 from caneflow.messages.control import Counters, Progress, Window
+from caneflow.runtime.dataflow.graph import Restart
 from caneflow.runtime.deployment import REPLAYER_MODULE, Deployment, linked, program_arguments
-from caneflow.runtime.graph import Restart
-from caneflow.runtime.links import Ports, open_session
-from caneflow.runtime.merge import BEGIN, END
+from caneflow.runtime.hosts.links import Ports, open_session
+from caneflow.runtime.hosts.processes import Exited, Line, Processes
+from caneflow.runtime.hosts.run_directory import RunDirectory
 from caneflow.runtime.plan import NodePlan
-from caneflow.runtime.processes import Exited, Line, Processes
-from caneflow.runtime.run_directory import RunDirectory
+from caneflow.runtime.stages.merge import BEGIN, END
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ import zenoh
 from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, encode
 from caneflow.messages.control import Again, Counters, LeftOut, PortMark, Progress, Window
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.links import open_session
+from caneflow.runtime.hosts.links import open_session
 from caneflow.runtime.plan import InputPlan, NodePlan
 
 log = logging.getLogger(__name__)

@@ -4,12 +4,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from caneflow.messages import SAMPLES, Sample
-from caneflow.runtime.graph import Queue, Wire
+from caneflow.runtime.dataflow.graph import Queue, Wire
+from caneflow.runtime.dataflow.programs import Located, inputs_of
+from caneflow.runtime.dataflow.yaml_file import Document
+from caneflow.runtime.dataflow.yaml_shape import ALL_LENGTH, FlowShape, InputShape, NodeShape, is_written
 from caneflow.runtime.program import ANY_PORT, Operator, Program
-from caneflow.runtime.programs import Located, inputs_of
 from caneflow.runtime.wording import did_you_mean, listed
-from caneflow.runtime.yaml_file import Document
-from caneflow.runtime.yaml_shape import ALL_LENGTH, FlowShape, InputShape, NodeShape, is_written
 
 MESSAGES = {kind.__name__: kind for kind in SAMPLES.values()} | SAMPLES  # `Imu` and `caneflow.Imu/1`
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from caneflow.messages import MessageError, Sample, decode
 from caneflow.recording import Recorded, Recording
+from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.deployment import Deployment, Replay, deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.graph import Graph
-from caneflow.runtime.in_process import InProcess
+from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.plan import InputPlan, NodePlan
 from caneflow.runtime.program import Context, Program, Sink
 

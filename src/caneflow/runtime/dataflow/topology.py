@@ -8,10 +8,10 @@ import ipaddress
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from caneflow.runtime.wiring import Part
+from caneflow.runtime.dataflow.wiring import Part
+from caneflow.runtime.dataflow.yaml_file import Document
+from caneflow.runtime.dataflow.yaml_shape import FlowShape, is_written
 from caneflow.runtime.wording import did_you_mean, listed
-from caneflow.runtime.yaml_file import Document
-from caneflow.runtime.yaml_shape import FlowShape, is_written
 
 EVERYWHERE = {"0.0.0.0", "[::]"}  # noqa: S104 - compared with, not bound to
 HIGHEST_PORT = 65535

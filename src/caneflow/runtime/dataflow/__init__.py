@@ -1,0 +1,1 @@
+"""What a dataflow.yaml says: read, checked with line and column, and drawn; nothing here runs anything."""

@@ -1,0 +1,1 @@
+"""Where a graph runs: as processes over Zenoh, or all in this process."""
