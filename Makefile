@@ -39,8 +39,11 @@ docs: $(BIN)/.installed
 soak: $(BIN)/.installed
 	$(BIN)/pytest -m long
 
+# On a machine that does nothing else: what a sample costs part by part, then a hop beside raw Zenoh and dora.
 bench: $(BIN)/.installed
 	$(BIN)/pytest --benchmark-enable --benchmark-only
+	$(BIN)/pip install --quiet --editable '.[peers]'
+	$(BIN)/python -m benchmarks.peers --write docs/performance_peers.md
 
 clean:
 	rm -rf $(VENV) build
