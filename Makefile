@@ -30,10 +30,11 @@ lint: $(BIN)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# What the pages say of messages and of dataflow.yaml is written from the code.
+# What the pages say of messages, commands and settings is written from the code; the site is build/site/index.html.
 docs: $(BIN)/.installed
 	$(BIN)/python -m caneflow.messages.reference docs
 	$(BIN)/python -m caneflow.runtime.dataflow.yaml_reference docs
+	$(BIN)/sphinx-build --fail-on-warning --quiet docs build/site
 
 # The long tests: every shared walk at real time and at full speed, calm and under load.
 soak: $(BIN)/.installed

@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import re
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,8 @@ from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import Emitted, Operator
 from caneflow.runtime.replays.evaluation import FIGURES, chosen_methods, estimates, evaluated, offered_methods
+from caneflow.runtime.replays.results_file import ResultsFile
+from caneflow.runtime.replays.workers import mapped_on_cluster
 from tools import evaluate, simulate
 
 ROOT = Path(__file__).parents[1]
@@ -201,7 +204,7 @@ def test_the_table_has_a_row_for_every_walk_and_the_papers_figures_beside_ours(
 ) -> None:
     text = "\n".join(evaluate.lines(answer[0]))
     assert text.count("swing_1") == text.count("stops_2") == 1
-    luenberger = next(line for line in text.splitlines() if line.startswith("luenberger  here"))
+    luenberger = next(line for line in text.splitlines() if line.split()[:2] == ["luenberger", "here"])
     figures = list(answer[0]["luenberger"].values())
     mean = sum(each["final_distance"] for each in figures) / 2
     duration = sum(each["duration"] for each in figures) / 2
@@ -224,3 +227,60 @@ def test_the_poses_are_not_recorded(walks: list[Path]) -> None:
     assert sorted(path.name for path in walks[0].parent.iterdir()) == ["stops_2.mcap", "swing_1.mcap"]
     with Recording(walks[0]) as recording:
         assert recording.streams_of(Pose) == []
+
+
+def test_a_fleet_goes_on_where_it_was_killed(walks: list[Path], tmp_path: Path) -> None:
+    """What was kept is not run again, until the recording or the settings are others."""
+    kept, wrong = tmp_path / "fleet.sqlite", tmp_path / "wrong.mcap"
+    wrong.write_text("no recording")
+    graph = load(FLOW)
+    (first, *_) = evaluated(FLOW, walks[:1], ["luenberger"])
+    with ResultsFile(kept, graph, ["luenberger"]) as results:
+        results.add(first)  # and here it was killed
+
+    done = caneflow("eval", *walks, wrong, "--methods", "luenberger", "--results", kept, "--json")
+    again = caneflow("eval", *walks, wrong, "--methods", "luenberger", "--results", kept, "--json")
+
+    assert (done.returncode, again.returncode) == (1, 1)
+    assert json.loads(again.stdout) == json.loads(done.stdout)
+    assert json.loads(done.stdout)["luenberger"][str(walks[0])] == first.figures["luenberger"]
+    with sqlite3.connect(kept) as file:
+        finished = dict(file.execute("SELECT recording, count(*) FROM evaluations GROUP BY recording"))
+        failures = file.execute("SELECT recording, method FROM failures").fetchall()
+    assert finished == dict.fromkeys([*map(str, walks), str(wrong)], 1)
+    assert failures == [(str(wrong), "luenberger")]
+    with ResultsFile(kept, graph, ["luenberger"]) as results:
+        assert results.get(walks[1]) is not None
+        walks[1].touch()
+        assert results.get(walks[1]) is None
+    with ResultsFile(kept, load(FLOW, ["fusion.luenberger.pole_velocity=0.9"]), ["luenberger"]) as results:
+        assert results.get(walks[0]) is None
+
+
+def test_another_programs_database_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "theirs.sqlite"
+    with sqlite3.connect(path) as file:
+        file.execute("CREATE TABLE theirs (value)")
+    with pytest.raises(DataflowError, match="another program's"):
+        ResultsFile(path, load(FLOW), ["luenberger"])
+    path.write_text("no database at all, but long enough to be looked at")
+    with pytest.raises(DataflowError, match=r"theirs\.sqlite"):
+        ResultsFile(path, load(FLOW), ["luenberger"])
+
+
+def test_a_cluster_gives_the_same_figures(walks: list[Path]) -> None:
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed (the extra `cluster`)")
+    alone = caneflow("eval", *walks, "--methods", "luenberger", "--json")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        there = cluster.scheduler_address
+        spread = caneflow("eval", *walks, "--methods", "luenberger", "--json", "--scheduler", there)
+    assert spread.returncode == 0, spread.stderr
+    assert json.loads(spread.stdout) == json.loads(alone.stdout)
+
+
+def test_a_cluster_that_is_not_there_is_one_line(walks: list[Path]) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed (the extra `cluster`)")
+    with pytest.raises(DataflowError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
+        list(mapped_on_cluster(str, walks, "tcp://127.0.0.1:9", timeout=1.0))

@@ -3,7 +3,9 @@
 import csv
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +16,7 @@ from rich.progress import track
 from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.replays.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated
+from caneflow.runtime.replays.results_file import ResultsFile
 
 FAILED_STATUS = 1
 
@@ -52,6 +55,18 @@ def command(
         typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting (may be given again)."),
     ] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="How many recordings at a time.")] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster whose workers do it; they see the same files."),
+    ] = None,
+    results_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--results",
+            metavar="FILE",
+            help="SQLite file for the results as they come; what it holds is not run again.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object: method, recording, figure.")] = False,
     csv_file: Annotated[
         Path | None,
@@ -61,15 +76,18 @@ def command(
     """Run the methods of `fusion` over recordings, all in one process each, and hold them against the truth.
 
     Without truth in a recording only the distance between end and start is known. Exit status 1: some recording
-    or method failed; the others are there.
+    or method failed; the others are there. With --results a fleet of recordings goes on where it was killed.
 
     Example: caneflow eval walks/*.mcap --methods luenberger,best --jobs 2
     """
     wanted = [word.strip() for word in methods.split(",")] if methods is not None else []
-    chosen = chosen_methods(load(flow, settings or ()), wanted)
+    graph = load(flow, settings or ())
+    chosen = chosen_methods(graph, wanted)
     recordings = list(dict.fromkeys(recordings))
-    results = evaluated(flow, recordings, chosen, overrides=settings or (), jobs=jobs)
-    done = list(_shown(results, len(recordings)))
+    run = partial(evaluated, flow, methods=chosen, overrides=settings or (), jobs=jobs, scheduler=scheduler)
+    with ResultsFile(results_file, graph, chosen) if results_file is not None else nullcontext() as kept:
+        results = run(recordings) if kept is None else _resumed(kept, recordings, run)
+        done = list(_shown(results, len(recordings)))
     by_method = gathered(chosen, done)
     if as_json:
         print(json.dumps(by_method, indent=2, allow_nan=False))
@@ -82,6 +100,22 @@ def command(
         print(f"caneflow eval: {line}", file=sys.stderr)
     if failures:
         raise typer.Exit(FAILED_STATUS)
+
+
+def _resumed(
+    kept: ResultsFile, recordings: Sequence[Path], run: Callable[[Sequence[Path]], Iterator[Evaluation]]
+) -> Iterator[Evaluation]:
+    """What is kept, then what had to be run, each kept as it comes; in the order in which they are had."""
+    missing = []
+    for recording in recordings:
+        known = kept.get(recording)
+        if known is None:
+            missing.append(recording)
+        else:
+            yield known
+    for made in run(missing):
+        kept.add(made)
+        yield made
 
 
 def gathered(methods: Sequence[str], results: Sequence[Evaluation]) -> By:

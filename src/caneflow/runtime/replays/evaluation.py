@@ -27,7 +27,7 @@ from caneflow.runtime.deployment import Replay, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.program import Sink
-from caneflow.runtime.replays.workers import mapped
+from caneflow.runtime.replays.workers import mapped, mapped_on_cluster
 from caneflow.runtime.wording import did_you_mean, listed, one_line
 
 ESTIMATOR = "fusion"  # the node whose methods are compared
@@ -85,15 +85,16 @@ def evaluated(
     *,
     overrides: Sequence[str] = (),
     jobs: int = 1,
+    scheduler: str | None = None,
     keep_tracks: bool = False,
 ) -> Iterator[Evaluation]:
     """An evaluation of each recording, in their order; with `jobs` > 1 in as many processes.
 
-    A recording or method that fails is in its evaluation's `failures`. Raises DataflowError for a graph that
-    cannot run at all.
+    With the address of a Dask `scheduler`, by its workers. A recording or method that fails is in its evaluation's
+    `failures`. Raises DataflowError for a graph that cannot run at all.
     """
     each = partial(_evaluate, flow, tuple(overrides), tuple(methods), keep_tracks)
-    return mapped(each, recordings, jobs)
+    return mapped(each, recordings, jobs) if scheduler is None else mapped_on_cluster(each, recordings, scheduler)
 
 
 def estimates(graph: Graph, recording: Path, methods: Sequence[str]) -> tuple[dict[str, Estimate], dict[str, str]]:

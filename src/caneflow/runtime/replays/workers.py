@@ -1,4 +1,4 @@
-"""The same function on many things, in this process or in several that end when this one does."""
+"""The same function on many things: in this process, in several that end when this one does, or on a Dask cluster."""
 
 import os
 import signal
@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import connection, get_context, parent_process
 from typing import TypeVar
+
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.wording import one_line
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
@@ -26,6 +29,35 @@ def mapped(function: Callable[[Given], Made], items: Sequence[Given], jobs: int)
             yield from pool.map(function, items)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def mapped_on_cluster(
+    function: Callable[[Given], Made], items: Sequence[Given], scheduler: str, timeout: float = 10.0
+) -> Iterator[Made]:
+    """The same on the workers of an existing Dask cluster, `scheduler` being its address.
+
+    The workers need caneflow and see the same files under the same paths. When the iteration is left early, what has
+    not been started is cancelled. Raises DataflowError when nobody answers within `timeout` s.
+    """
+    try:
+        from distributed import Client  # an extra, and slow to import
+    except ImportError:
+        raise DataflowError("--scheduler needs Dask: pip install 'caneflow[cluster]'") from None
+    try:
+        client = Client(scheduler, timeout=timeout, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise DataflowError(f"no Dask scheduler at {scheduler}: {one_line(error)}") from error
+    with client:
+        # pure=False: the same recording may have changed since; retries: a worker may be taken away.
+        futures = client.map(function, items, pure=False, retries=2)
+        try:
+            for index in range(len(futures)):
+                made: Made = futures[index].result()
+                futures[index].release()  # type: ignore[no-untyped-call]
+                yield made
+        except BaseException:
+            client.cancel(futures, force=True)  # type: ignore[no-untyped-call]
             raise
 
 

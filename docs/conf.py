@@ -1,0 +1,23 @@
+"""The documentation as a site: `make docs` builds it into build/site; a warning is an error."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import reference_pages
+
+import caneflow
+
+project = "caneflow"
+author = "the caneflow authors"
+version = release = caneflow.__version__
+extensions = ["myst_parser", "sphinx_copybutton"]
+myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
+myst_heading_anchors = 3
+html_theme = "furo"
+html_title = "caneflow"
+exclude_patterns = ["performance_peers.md"]  # part of performance.md
+suppress_warnings = ["myst.xref_missing"]  # links to files of the repository that are no pages of the site
+
+reference_pages.write(Path(__file__).parent / "reference")
