@@ -1,6 +1,7 @@
 """The door of the `caneflow` command: finds the tool for a word, and turns an expected error into one line."""
 
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Annotated, Any, NoReturn
@@ -27,6 +28,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "hz": ("hz", "Show how often the samples of a running flow come."),
     "echo": ("echo", "Print the samples of a running flow."),
     "top": ("top", "Show what each node of a running flow costs."),
+    "record": ("record_now", "Write the last seconds of a running flow to a file."),
     "doctor": ("doctor", "Say what is wrong with a running flow."),
     "simulate": ("simulate", "Make a recording of a walk that nobody walked."),
     "info": ("info", "Say what is in a recording."),
@@ -92,6 +94,15 @@ def _command() -> TyperGroup:
         if find_spec(f"{TOOLS}.{module}"):
             group.add_command(Word(word, module, summary))
     return group
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every command that there is, by its words, with its tool imported: for pages that are written from it."""
+    for word, (module, _) in WORDS.items():
+        if find_spec(f"{TOOLS}.{module}"):
+            tool = _tool(module)
+            within = getattr(tool, "commands", None)
+            yield from ((f"{word} {name}", each) for name, each in within.items()) if within else [(word, tool)]
 
 
 def _print_version(wanted: bool) -> None:
