@@ -21,9 +21,10 @@ from caneflow.messages import Imu
 from caneflow.protocols import bno055
 from caneflow.protocols.bno055 import CalibrationProfile, Measurement, Mode
 from caneflow.protocols.bno055_chip import Chip, Reading, Setup
-from caneflow.protocols.bno055_link import Faults, I2cLink, Link, UartLink
-from caneflow.protocols.bno055_pacing import Pacing, Spacing, Verdict
+from caneflow.protocols.bno055_link import UartLink
 from caneflow.protocols.errors import ProtocolError
+from caneflow.protocols.pacing import Pacing, Spacing, Verdict
+from caneflow.protocols.register_link import Faults, I2cLink, Link
 from caneflow.runtime import Brought, Context, Quiet, Source
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.node import run
@@ -99,7 +100,7 @@ class Bno055(Source):
         self._said = ""  # the last warning
         self._give_up = math.inf  # s, monotonic, unless there is a sample by then
         self._next_revival = 0.0  # s, monotonic
-        self._pacing = Pacing(settings.rate, time.monotonic())
+        self._pacing = Pacing(settings.rate, time.monotonic(), chip_rate=bno055.RATE)
         self._report = Report(self._pacing, 1.0 / settings.rate)
 
     def samples(self) -> Brought:

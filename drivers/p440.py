@@ -228,7 +228,7 @@ class Radar:
         self._link = link
         self._clock = clock
         self._number = 0  # of the last request
-        self._early: deque[ScanInfo] = deque(maxlen=MOST_EARLY)
+        self._early: deque[tuple[ScanInfo, int]] = deque(maxlen=MOST_EARLY)  # with their arrival
         self.unknown = 0  # messages that were none, or of no known type
 
     def ask(self, request: mrm.Message, answer: type[A], *, tries: int = TRIES) -> A:
@@ -241,7 +241,7 @@ class Radar:
                 if isinstance(message, answer) and message.message_id == self._number:
                     return message
                 if isinstance(message, ScanInfo):
-                    self._early.append(message)
+                    self._early.append((message, self._clock.now()))
         raise Silent(f"no answer within {tries * ANSWER_TIME:g} s")
 
     def start(self, period_us: int) -> int:
@@ -263,14 +263,17 @@ class Radar:
                 return True
         return False
 
-    def next_packet(self, timeout: float) -> ScanInfo | None:
-        """The next packet of a scan; None when none comes in time. Raises Silent when the radar has booted."""
+    def next_packet(self, timeout: float) -> tuple[ScanInfo, int] | None:
+        """The next packet of a scan and its arrival (ns of the steady clock); None when none comes in time.
+
+        Raises Silent when the radar has booted.
+        """
         if self._early:
             return self._early.popleft()
         message = self._hear(timeout)
         if isinstance(message, mrm.ReadyInfo):
             raise Silent("has been started anew")
-        return message if isinstance(message, ScanInfo) else None
+        return (message, self._clock.now()) if isinstance(message, ScanInfo) else None
 
     def _falls_still(self) -> bool:
         """Whether no scan comes for a moment after the confirm or, without one, for as long as an answer may take."""
@@ -443,14 +446,13 @@ class P440(Source):
         self._next_loss_line = max(self._next_loss_line, heard + round(FIRST_LOSS_LINE * 1e9))
         try:
             while True:
-                packet = radar.next_packet(settings.silence_s - (self._clock.now() - heard) / 1e9)
-                now = self._clock.now()
-                if packet is not None:
-                    heard = now
-                    self._note_arrival(packet, now)
+                found = radar.next_packet(settings.silence_s - (self._clock.now() - heard) / 1e9)
+                if found is not None:
+                    packet, heard = found
+                    self._note_arrival(packet, heard)
                     for scan in assembler.feed(packet):
                         yield from self._told_frames(scan)
-                elif (now - heard) / 1e9 >= settings.silence_s:
+                elif (self._clock.now() - heard) / 1e9 >= settings.silence_s:
                     raise Silent(f"has sent no scan for {settings.silence_s:g} s")
         except (Silent, OSError):
             for scan in assembler.finish():

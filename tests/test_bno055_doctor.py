@@ -87,7 +87,9 @@ def test_a_port_that_another_program_holds(look: Any, terminal: str) -> None:
 
     with serial.Serial(terminal, exclusive=True):
         (finding,), _ = look(imu(terminal), "imu/imu")
-    assert finding["attempts"] == ["end the flow that uses it: it holds the port alone"]
+    holder, otherwise = finding["attempts"]
+    assert f"(process {os.getpid()}) holds it: end that" in holder
+    assert otherwise == "end the flow that uses it: it holds the port alone"
 
 
 def test_a_file_that_is_no_port(look: Any, tmp_path: Path) -> None:

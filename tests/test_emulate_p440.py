@@ -154,6 +154,39 @@ def test_ctrl_c_leaves_the_radar_stopped(flow: Path, tmp_path: Path, start: Call
         assert got.streams["radar", "frame"].count > 100
 
 
+def frames_of(path: Path) -> list[RadarFrame]:
+    with Recording(path) as recording:
+        decoded = [sample.decoded() for sample in recording.samples([("radar", "frame")])]
+    return [frame for frame in decoded if isinstance(frame, RadarFrame)]
+
+
+@pytest.mark.parametrize(
+    ("name", "scans"), [("test_scan2.txt", 100), pytest.param("test_scan711_1000.txt", 427, marks=pytest.mark.long)]
+)
+def test_recorded_packets_over_udp_give_the_importers_frames(
+    name: str, scans: int, flow: Path, tmp_path: Path, start: Callable[..., Started]
+) -> None:
+    log = Path(__file__).parents[1].parent / "shared" / "data" / "p440-udp-loss" / name
+    if not log.exists():
+        pytest.skip("the recorded packets are not here")
+    imported, out = tmp_path / "imported.mcap", tmp_path / "out.mcap"
+    assert start("import", "p440", log, "-o", imported).end()[0] == 0
+    emulator = start("emulate", "p440", log, "--port", "0")
+    port = emulator.wait_for(r"UDP port (\d+)")[1]
+    running = start("run", flow, *live(port), "--set", "radar.scan_period_us=0", "--record", out)
+    running.wait_for("has sent no scan")  # the log is over
+    assert running.end(signal.SIGINT)[0] == 130
+    assert "the recording is over" in emulator.end()[1]
+    got, given = frames_of(out), frames_of(imported)
+    assert len(got) == len(given) == scans
+    for frame, was in zip(got, given, strict=True):
+        assert np.array_equal(frame.scans, was.scans)
+        assert (frame.range_start, frame.range_step) == (was.range_start, was.range_step)
+        assert frame.scan_period == pytest.approx(was.scan_period, rel=3e-3)
+        late = (frame.stamp - got[0].stamp) - (was.stamp - given[0].stamp)
+        assert abs(late) < 5e6, "the importer's stamps are whole ms, the driver's a line fit"
+
+
 @pytest.mark.parametrize("what", ["no radar", "complex", "no such radar", "port", "cut log"])
 def test_what_cannot_be_played_is_named_in_one_line(what: str, tmp_path: Path) -> None:
     path = tmp_path / "given.mcap"

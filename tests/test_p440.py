@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import math
 import os
 import pty
 import socket
@@ -262,7 +263,7 @@ def test_a_radar_slower_than_asked_is_found_out(caplog: pytest.LogCaptureFixture
 
 def test_a_silent_radar_is_started_anew(caplog: pytest.LogCaptureFixture) -> None:
     scans = [scan(number) for number in range(400)]
-    desk = Desk(moments(scans), faults=Faults(freeze_at=2.0)).run()
+    desk = Desk(moments(scans), faults=Faults(freezes=((2.0, math.inf),))).run()
     gap = max(np.diff([f.stamp for f in desk.frames])) / SECOND
     assert 0.5 < gap < 1.1
     assert len(desk.frames) == pytest.approx(400 - 100 * gap, abs=2)
@@ -271,7 +272,7 @@ def test_a_silent_radar_is_started_anew(caplog: pytest.LogCaptureFixture) -> Non
 
 def test_an_unplugged_radar_is_back_within_a_second_of_its_return(caplog: pytest.LogCaptureFixture) -> None:
     scans = [scan(number) for number in range(800)]
-    desk = Desk(moments(scans), faults=Faults(unplug_at=2.0, unplug_for=3.0)).run()
+    desk = Desk(moments(scans), faults=Faults(unplugs=((2.0, 3.0),))).run()
     begin = desk.times[0]
     assert 3.0 < max(np.diff(desk.times)) < 4.0
     assert max(np.diff([f.stamp for f in desk.frames])) / SECOND > 3.0, "the gap is visible"
@@ -385,6 +386,27 @@ def test_radars_that_keep_silent_sleep_or_do_something_else(options: dict[str, A
     desk = Desk(moments([scan(number) for number in range(100)]), **options).run()
     assert len(desk.frames) == 100
     assert not desk.radar.scanning
+
+
+class Taciturn(RadarEmulator):
+    """Starts to scan, and its word that it does gets lost on the way."""
+
+    def _control(self, number: int, count: int, now: float) -> mrm.Message | None:
+        said = super()._control(number, count, now)
+        return None if count else said
+
+
+def test_scans_that_come_while_the_start_is_not_confirmed_are_stamped_as_they_came() -> None:
+    desk = Desk(iter(()))
+    desk.radar = Taciturn(
+        moments([scan(number) for number in range(200)]), config=CONFIG, random=np.random.default_rng(4)
+    )
+    desk.link._radar = desk.radar
+    desk.run()
+    assert len(desk.frames) == 200
+    begun = desk.frames[-1].stamp - 199 * 10_000_000
+    late = [frame.stamp - begun - 10_000_000 * number for number, frame in enumerate(desk.frames)]
+    assert max(map(abs, late)) < 2_000_000, "ns; an answer is waited for 250 ms"
 
 
 class Stubborn(RadarEmulator):

@@ -1,5 +1,6 @@
 """The emulated P440: the protocol it speaks, the faults it has, and what it makes of recorded packets."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -155,7 +156,7 @@ def test_faults_are_as_frequent_as_asked() -> None:
 
 
 def test_it_freezes_once_until_it_is_started_anew() -> None:
-    radar = emulator(faults=Faults(freeze_at=0.3))
+    radar = emulator(faults=Faults(freezes=((0.3, math.inf),)))
     asked(radar, START)
     assert max(p.message_id for p in sent(radar, every_10_ms(0.0, 0.5))) == 29
     assert not radar.scanning
@@ -163,8 +164,26 @@ def test_it_freezes_once_until_it_is_started_anew() -> None:
     assert [p.message_id for p in sent(radar, every_10_ms(0.5, 0.53))] == [51, 51, 52, 52]
 
 
+def test_a_freeze_may_end_by_itself_and_come_again() -> None:
+    radar = emulator(faults=Faults(freezes=((0.6, 0.1), (0.3, 0.1))))
+    asked(radar, START)
+    seen = sorted({p.message_id for p in sent(radar, every_10_ms(0.0, 0.8))})
+    assert seen == [*range(30), *range(40, 60), *range(70, seen[-1] + 1)]
+    assert seen[-1] >= 78
+
+
+def test_power_may_fail_more_than_once() -> None:
+    radar = emulator(faults=Faults(unplugs=((0.1, 0.1), (0.4, 0.1))))
+    asked(radar, START)
+    ready = []
+    for now in every_10_ms(0.0, 0.7):
+        said = [mrm.parse(message) for message in radar.send_due(now)]
+        ready += [now for message in said if isinstance(message, mrm.ReadyInfo)]
+    assert ready == pytest.approx([0.2, 0.5], abs=0.015)
+
+
 def test_without_power_it_is_silent_and_then_it_has_booted() -> None:
-    radar = emulator(faults=Faults(unplug_at=0.3, unplug_for=0.2))
+    radar = emulator(faults=Faults(unplugs=((0.3, 0.2),)))
     asked(radar, START)
     assert max(p.message_id for p in sent(radar, every_10_ms(0.0, 0.4))) == 29
     assert not radar.receive(mrm.build(START), 0.41)

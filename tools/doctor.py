@@ -10,23 +10,32 @@ import socket
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import psutil
 import typer
 
 from caneflow.errors import CaneflowError
-from caneflow.messages import Imu, RadarFrame, Sample
+from caneflow.messages import DopplerBlock, Imu, RadarFrame, Sample
 from caneflow.messages.rig import read_rig
 from caneflow.protocols import bno055, mrm
-from caneflow.protocols.bno055_chip import Chip, Identity
-from caneflow.protocols.bno055_link import I2cLink, Link, UartLink
+from caneflow.protocols.bno055_chip import Chip as Bno055Chip
+from caneflow.protocols.bno055_chip import Identity
+from caneflow.protocols.bno055_link import UartLink
 from caneflow.protocols.errors import ProtocolError
+from caneflow.protocols.mpu9250 import MAGNETOMETER_ADDRESS
+from caneflow.protocols.mpu9250_chip import NAME as MPU9250
+from caneflow.protocols.mpu9250_chip import Chip as Mpu9250Chip
+from caneflow.protocols.mpu9250_chip import Setup
+from caneflow.protocols.register_link import I2cLink, Link
+from caneflow.recording.sound_file import SoundFile
 from caneflow.runtime import Context, Quiet, Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.dataflow.loading import load
@@ -122,25 +131,18 @@ def _bno055(node: Node) -> Iterator[Finding]:
     """Whether the port can be opened and a chip answers, and how fast."""
     settings = node.settings
     path = Path(settings.port)
-    if not path.exists():
-        yield Finding(node=node.name, state="bad", text=f"{path} is not there", attempts=_to_make_appear(node, path))
-        return
-    if not os.access(path, os.R_OK | os.W_OK):
-        text = f"{path} may not be opened by {getpass.getuser()}"
-        yield Finding(node=node.name, state="bad", text=text, attempts=_to_be_permitted(path))
-        return
+    for finding in _at_port(node, path, "serial" if settings.bus == "uart" else "smbus2"):
+        yield finding
+        if finding.state == "bad":
+            return
     try:
         with _link(settings) as link:
-            chip = Chip(link, time.sleep)
-            yield from _chip(node, chip)
+            yield from _chip(node, Bno055Chip(link, time.sleep))
     except OSError as error:
-        busy = error.errno in (errno.EAGAIN, errno.EBUSY)
-        attempt = "end the flow that uses it: it holds the port alone" if busy else f"is {path} the right one?"
-        text = f"{path}: {error.strerror or error}"
-        yield Finding(node=node.name, state="bad", text=text, attempts=(attempt,))
+        yield _not_opened(node, path, error)
 
 
-def _chip(node: Node, chip: Chip) -> Iterator[Finding]:
+def _chip(node: Node, chip: Bno055Chip) -> Iterator[Finding]:
     where, i2c = f"{node.settings.port}", node.settings.bus == "i2c"
     if i2c:
         where += f", address 0x{node.settings.address:02X}"
@@ -164,7 +166,7 @@ def _failed_parts(identity: Identity) -> str:
     return ", ".join(part for bit, part in enumerate(parts) if not identity.self_test >> bit & 1)
 
 
-def _speed(node: Node, chip: Chip) -> Finding:
+def _speed(node: Node, chip: Bno055Chip) -> Finding:
     """How long one reading takes, against the rate that is asked for."""
     block = bno055.WHOLE if node.settings.accel_and_mag else bno055.WITHOUT_ACCEL_AND_MAG
     took = []
@@ -186,27 +188,6 @@ def _speed(node: Node, chip: Chip) -> Finding:
     elif sum(chip.link.faults) > MOST_OVERRUNS * PROBE_READS:
         attempts = ("shorter wires, one common ground, 3.3 V at the chip while it runs",)
     return Finding(node=node.name, state="look" if attempts else "ok", text=text, attempts=attempts)
-
-
-def _to_make_appear(node: Node, path: Path) -> tuple[str, ...]:
-    if path.name.startswith("i2c"):
-        return (
-            "switch I2C on: sudo raspi-config, Interface Options, I2C; then reboot",
-            "see which buses there are: ls /dev/i2c-*",
-        )
-    return (
-        "switch the serial port on: sudo raspi-config, Interface Options, Serial Port: no login shell, hardware yes; "
-        "then reboot",
-        f"with an adapter on USB see ls /dev/ttyUSB* /dev/ttyACM*, then --set {node.name}.port=...",
-    )
-
-
-def _to_be_permitted(path: Path) -> tuple[str, ...]:
-    group = path.group()
-    attempts = [f"sudo usermod -aG {group} {getpass.getuser()}, then log in anew"]
-    if group == "tty":  # a login shell has it
-        attempts.insert(0, f"sudo systemctl disable --now serial-getty@{path.resolve().name}: a login shell has it")
-    return tuple(attempts)
 
 
 UART_ATTEMPTS = (
@@ -239,10 +220,7 @@ def _to_be_faster(node: Node) -> tuple[str, ...]:
 
 @contextmanager
 def _link(settings: Any) -> Iterator[Link]:
-    """The way to a BNO055; raises CaneflowError when its package is not installed."""
-    package = "serial" if settings.bus == "uart" else "smbus2"
-    if find_spec(package) is None:
-        raise CaneflowError(f"no Python package {package}; it comes with `pip install caneflow[devices]`")
+    """The way to a BNO055; raises OSError when it cannot be opened."""
     if settings.bus == "uart":
         import serial
 
@@ -250,18 +228,164 @@ def _link(settings: Any) -> Iterator[Link]:
         with serial.Serial(settings.port, settings.baud, timeout=timeout, exclusive=True) as port:
             yield UartLink(port, time.sleep, time.time_ns)
     else:
-        import smbus2
+        with opened_bus(settings.port) as transfer:
+            yield I2cLink(partial(transfer, settings.address), time.sleep, time.time_ns)
 
-        with smbus2.SMBus(settings.port) as bus:
 
-            def transfer(data: bytes, length: int) -> bytes:
-                messages = [smbus2.i2c_msg.write(settings.address, data)]
-                if length:
-                    messages.append(smbus2.i2c_msg.read(settings.address, length))
-                bus.i2c_rdwr(*messages)
-                return bytes(messages[-1]) if length else b""
+# --- MPU-9250 ---------------------------------------------------------------------------------------------------
 
-            yield I2cLink(transfer, time.sleep, time.time_ns)
+
+def _mpu9250(node: Node) -> Iterator[Finding]:
+    """Whether both dies answer on the bus, and whether the chip can be set up."""
+    settings = node.settings
+    path = Path(f"/dev/i2c-{settings.bus}")
+    for finding in _at_port(node, path, "smbus2"):
+        yield finding
+        if finding.state == "bad":
+            return
+    where = f"{path}, address 0x{settings.address:02X}"
+    try:
+        with opened_bus(str(path)) as transfer:
+            inertial, magnetometer = partial(transfer, settings.address), partial(transfer, MAGNETOMETER_ADDRESS)
+            chip = Mpu9250Chip(
+                I2cLink(inertial, time.sleep, time.time_ns, device=MPU9250),
+                I2cLink(magnetometer, time.sleep, time.time_ns, device=f"{MPU9250}, magnetometer"),
+                time.sleep,
+            )
+            name = chip.require(magnetometer=settings.magnetometer)
+            chip.set_up(Setup(magnetometer=settings.magnetometer))
+    except OSError as error:
+        yield _not_opened(node, path, error)
+    except ProtocolError as error:
+        other = 0x69 if settings.address == 0x68 else 0x68
+        attempts = (
+            f"see who is on the bus: i2cdetect -y {settings.bus}; it may be address 0x{other:02X} (AD0 high: 0x69), "
+            f"then --set {node.name}.address=0x{other:02X}",
+            "SDA to GPIO 2 (pin 3), SCL to GPIO 3 (pin 5), 3.3 V, ground; nCS high, or the chip speaks SPI",
+            f"a board sold as an MPU-9250 may hold an MPU-6500: --set {node.name}.magnetometer=false",
+        )
+        yield Finding(node=node.name, state="bad", text=f"no MPU-9250 on {where}: {error}", attempts=attempts)
+    else:
+        yield Finding(node=node.name, state="ok", text=f"{name} on {where}, set up; {chip.link.faults}")
+
+
+# --- ports and buses --------------------------------------------------------------------------------------------
+
+
+def _at_port(node: Node, path: Path, package: str) -> Iterator[Finding]:
+    """What keeps a port or a bus from being opened, or others from being heard there."""
+    if find_spec(package) is None:
+        attempts = ("pip install 'caneflow[devices]'",)
+        yield Finding(node=node.name, state="bad", text=f"no Python package {package}", attempts=attempts)
+    elif not path.exists():
+        yield Finding(node=node.name, state="bad", text=f"{path} is not there", attempts=_to_make_appear(node, path))
+    elif not os.access(path, os.R_OK | os.W_OK):
+        text = f"{path} may not be opened by {getpass.getuser()}"
+        yield Finding(node=node.name, state="bad", text=text, attempts=_to_be_permitted(path))
+    elif _is_console(path):
+        text = f"{path} is the system's console as well: it writes there, and what you write it takes for a login"
+        yield Finding(node=node.name, state="look", text=text, attempts=_to_end_console(path))
+    elif _garbles_stretched_clocks(path) and node.run == "drivers.bno055":
+        text = f"{path} is a Raspberry Pi's own I2C, which garbles what a chip says that stretches the clock, as this"
+        yield Finding(node=node.name, state="look", text=text, attempts=CLOCK_STRETCHING)
+
+
+def _not_opened(node: Node, path: Path, error: OSError) -> Finding:
+    attempts: tuple[str, ...] = (f"is {path} the right one?",)
+    if error.errno in (errno.EAGAIN, errno.EBUSY):
+        attempts = ("end the flow that uses it: it holds the port alone",)
+        if holders := _holders(path):
+            attempts = (f"{', '.join(holders)} holds it: end that, as a port is for one", *attempts)
+    return Finding(node=node.name, state="bad", text=f"{path}: {error.strerror or error}", attempts=attempts)
+
+
+def _to_make_appear(node: Node, path: Path) -> tuple[str, ...]:
+    if path.name.startswith("i2c"):
+        return (
+            "switch I2C on: sudo raspi-config, Interface Options, I2C; then reboot",
+            f"see which buses there are: ls /dev/i2c-*; now: {_there('/dev', 'i2c-*')}",
+        )
+    setting = "device" if node.run == "drivers.p440" else "port"
+    return (
+        "switch the serial port on: sudo raspi-config, Interface Options, Serial Port: no login shell, hardware yes; "
+        "then reboot",
+        f"with an adapter on USB see ls /dev/ttyUSB* /dev/ttyACM*, then --set {node.name}.{setting}=...; "
+        f"now: {_there('/dev', 'ttyUSB*', 'ttyACM*')}",
+    )
+
+
+def _there(folder: str, *patterns: str) -> str:
+    return " ".join(sorted(str(path) for pattern in patterns for path in Path(folder).glob(pattern))) or "none"
+
+
+def _to_be_permitted(path: Path) -> tuple[str, ...]:
+    group = path.group()
+    attempts = [f"sudo usermod -aG {group} {getpass.getuser()}, then log in anew"]
+    if group == "tty":  # a login shell has it
+        attempts = [*_to_end_console(path), *attempts]
+    return tuple(attempts)
+
+
+def _to_end_console(path: Path) -> tuple[str, ...]:
+    return (
+        f"sudo systemctl disable --now serial-getty@{path.resolve().name}: a login shell has it",
+        "sudo raspi-config, Interface Options, Serial Port: no login shell, hardware yes (it takes console=serial0 out "
+        "of cmdline.txt); then reboot",
+    )
+
+
+def _is_console(path: Path) -> bool:
+    """Whether the kernel writes its messages to a serial port."""
+    words = _text(KERNEL_OPTIONS).split()
+    consoles = [word.removeprefix("console=").partition(",")[0] for word in words if word.startswith("console=")]
+    return path.resolve().name in {Path("/dev", name).resolve().name for name in consoles}
+
+
+def _garbles_stretched_clocks(path: Path) -> bool:
+    """Whether a bus is that of a Raspberry Pi's own controller, and not one of i2c-gpio."""
+    return "bcm2835" in _text(I2C_NAMES / path.name / "name")
+
+
+def _holders(path: Path) -> list[str]:
+    """Programs that have a port open, as far as they may be seen."""
+    wanted, found = str(path.resolve()), []
+    for process in psutil.process_iter(["name"]):
+        with suppress(OSError):
+            if any(str(file.readlink()) == wanted for file in Path(f"/proc/{process.pid}/fd").iterdir()):
+                found.append(f"{process.info['name']} (process {process.pid})")
+    return found
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""
+
+
+KERNEL_OPTIONS = Path("/proc/cmdline")
+I2C_NAMES = Path("/sys/class/i2c-dev")
+CLOCK_STRETCHING = (
+    "dtoverlay=i2c-gpio,bus=3 in config.txt (docs/hardware.md), reboot, then the bus that it makes: /dev/i2c-3",
+    "or use the UART, which has no such trouble: PS1 high, PS0 low",
+)
+
+
+@contextmanager
+def opened_bus(path: str) -> Iterator[Callable[[int, bytes, int], bytes]]:
+    """Transfers on an I2C bus: address, what to write, bytes to read; raises OSError when it cannot be opened."""
+    import smbus2
+
+    with smbus2.SMBus(path) as bus:
+
+        def transfer(address: int, data: bytes, length: int) -> bytes:
+            messages = [smbus2.i2c_msg.write(address, data)]
+            if length:
+                messages.append(smbus2.i2c_msg.read(address, length))
+            bus.i2c_rdwr(*messages)
+            return bytes(messages[-1]) if length else b""
+
+        yield transfer
 
 
 # --- P440 -------------------------------------------------------------------------------------------------------
@@ -271,7 +395,7 @@ def _p440(node: Node) -> Iterator[Finding]:
     """Whether a radar answers on Ethernet, and how it is; on a serial link only the stream tells."""
     settings = node.settings
     if settings.link != "udp":
-        yield from _serial_port(node, Path(settings.device))
+        yield from _at_port(node, Path(settings.device), "serial")
         return
     where = f"{settings.host}, UDP port {settings.port}"
     try:
@@ -288,15 +412,6 @@ def _p440(node: Node) -> Iterator[Finding]:
         attempts = ("take its power off and on; the same again: the module is broken",)
         text = f"its self-test says 0x{said.self_test:02X}; good is 0"
         yield Finding(node=node.name, state="look", text=text, attempts=attempts)
-
-
-def _serial_port(node: Node, path: Path) -> Iterator[Finding]:
-    if not path.exists():
-        attempts = ("see ls /dev/ttyACM* /dev/ttyUSB*, then --set " + f"{node.name}.device=...",)
-        yield Finding(node=node.name, state="bad", text=f"{path} is not there", attempts=attempts)
-    elif not os.access(path, os.R_OK | os.W_OK):
-        text = f"{path} may not be opened by {getpass.getuser()}"
-        yield Finding(node=node.name, state="bad", text=text, attempts=_to_be_permitted(path))
 
 
 def _radar_status(host: str, port: int) -> mrm.GetStatusConfirm:
@@ -323,12 +438,125 @@ def _network_attempts(node: Node, error: OSError) -> tuple[str, ...]:
         return (f"{host} is there, but no radar: find the radar's address, then --set {node.name}.host=...",)
     if isinstance(error, socket.gaierror):
         return (f"{host} is no address; the radar's own is 192.168.1.100 unless it was changed",)
-    network = host.rpartition(".")[0]
-    return (
-        f"give the network interface an address beside it: sudo ip addr add {network}.10/24 dev eth0",
+    attempts = [
         f"ping {host}: when that is silent too, see cable and power (5 to 48 V, 3 W)",
-        f"let its answers through the firewall: sudo ufw allow proto udp from {host} port {port}",
+        "the radar sends to one host only: end the flow, or the vendor's program, that has it",
+    ]
+    firewall = f"let its answers through the firewall: sudo ufw allow proto udp from {host} port {port}"
+    attempts.insert(0 if "ENABLED=yes" in _text(FIREWALL) else len(attempts), firewall)
+    network, own = host.rpartition(".")[0], _own_address(host)
+    if own is None or own.rpartition(".")[0] != network:
+        via = "there is no way to it" if own is None else f"this host would ask from {own}"
+        attempts.insert(0, f"{via}: give it an address beside it: sudo ip addr add {network}.10/24 dev eth0")
+    return tuple(attempts)
+
+
+def _own_address(host: str) -> str | None:
+    """The address from which this host would ask another one; None: it has no way there."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as udp:
+        try:
+            udp.connect((host, mrm.UDP_PORT))
+        except OSError:
+            return None
+        address: str = udp.getsockname()[0]
+        return address
+
+
+FIREWALL = Path("/etc/ufw/ufw.conf")
+
+
+# --- Doppler modules --------------------------------------------------------------------------------------------
+
+
+def _doppler_adc(node: Node) -> Iterator[Finding]:
+    """Whether there is a sound file or an input of a sound card that takes the settings."""
+    settings = node.settings
+    if settings.file is not None:
+        yield from _sound_file(node)
+        return
+    try:
+        import sounddevice  # type: ignore[import-untyped]  # it has no types
+    except ImportError:
+        attempts = ("pip install 'caneflow[audio]'",)
+        yield Finding(node=node.name, state="bad", text="no Python package sounddevice", attempts=attempts)
+        return
+    except OSError:
+        attempts = ("sudo apt install libportaudio2",)
+        yield Finding(node=node.name, state="bad", text="PortAudio is not installed", attempts=attempts)
+        return
+    yield _sound_card(node, sounddevice)
+
+
+def _sound_card(node: Node, sounddevice: Any) -> Finding:
+    """Whether there is such an input, and it takes the settings."""
+    settings = node.settings
+    inputs = [found for found in sounddevice.query_devices() if found["max_input_channels"]]
+    if not inputs:
+        return Finding(node=node.name, state="bad", text="there is no sound card with an input", attempts=NO_CARD)
+    device: str | int | None = None if settings.device == "default" else settings.device
+    device = int(device) if isinstance(device, str) and device.isdigit() else device
+    needed, rate = settings.channels.needed, settings.sample_rate
+    try:
+        name = sounddevice.query_devices(device, "input")["name"]
+        sounddevice.check_input_settings(device, needed, settings.sample_format, samplerate=rate)
+    except (sounddevice.PortAudioError, ValueError) as error:
+        text = f"{settings.device}: {str(error).partition(' [PaErrorCode')[0]}"
+        there = "; ".join(f"{found['index']}: {found['name']}" for found in inputs)
+        attempts = (f"one of these inputs: {there}; then --set {node.name}.device=...", *_to_be_taken(node))
+        return Finding(node=node.name, state="bad", text=text, attempts=attempts)
+    channels = "1 channel" if needed == 1 else f"{needed} channels"
+    return Finding(node=node.name, state="ok", text=f"{name}: takes {channels} at {rate:g} Hz")
+
+
+def _to_be_taken(node: Node) -> tuple[str, ...]:
+    return (
+        f"a rate and channels that it has: --set {node.name}.sample_rate=48000, {node.name}.channel=0; "
+        "ALSA's default and plughw convert, hw does not",
+        "when it is in use: end the program that has it, or share it by ALSA's dsnoop (docs/hardware.md)",
     )
+
+
+def _sound_file(node: Node) -> Iterator[Finding]:
+    settings = node.settings
+    try:
+        sound = SoundFile(settings.file, settings.channels, block=settings.block)
+    except CaneflowError as error:
+        attempts = (f"a WAV or FLAC file that has the channels: --set {node.name}.file=... {node.name}.channel=0",)
+        yield Finding(node=node.name, state="bad", text=str(error), attempts=attempts)
+        return
+    length = f"{sound.frames / sound.sample_rate:.1f} s at {sound.sample_rate:g} Hz, {sound.subtype}"
+    yield Finding(node=node.name, state="ok", text=f"{settings.file}: {length}")
+
+
+NO_CARD = (
+    "see what ALSA has: arecord -l; a card on USB has to be plugged in",
+    f"sudo usermod -aG audio {getpass.getuser()}, then log in anew: others may not use it",
+)
+
+
+def _sound(node: Node, blocks: list[DopplerBlock]) -> Iterator[Finding]:
+    """How loud a module is: a dead wire and an overdriven input look alike to a spectrum."""
+    samples = np.concatenate([block.samples for block in blocks])
+    full = 2.0**15 if samples.dtype.kind == "i" else 1.0
+    parts = np.concatenate([samples.real, samples.imag]) if samples.dtype.kind == "c" else samples
+    peak = float(np.abs(parts.astype(np.float64)).max()) / full
+    rms = float(np.std(parts.astype(np.float64))) / full
+    clipped = float((np.abs(parts.astype(np.float64)) >= full * (1.0 - 2.0**-14)).mean())
+    text = f"loudest {peak:.3f} of full scale, {20 * math.log10(max(rms, 1e-6)):.0f} dB in the mean"
+    attempts: tuple[str, ...] = ()
+    if rms < 2.0**-15:
+        text = "silent: not a bit changes"
+        attempts = (
+            "is the module powered, and on this channel? its wire to the input, its ground to the input's",
+            "the input may be muted or its gain 0: alsamixer, capture (F4)",
+        )
+    elif clipped > CLIPPED:
+        text += f", {100 * clipped:.1f} % of the samples at its end"
+        attempts = ("less gain: alsamixer, capture (F4); or a divider before the input",)
+    yield Finding(node=node.name, state="look" if attempts else "ok", text=text, attempts=attempts)
+
+
+CLIPPED = 0.001  # part of the samples
 
 
 # --- any driver -------------------------------------------------------------------------------------------------
@@ -339,17 +567,21 @@ def _stream(node: Node, seconds: float, rig: dict[str, Any]) -> Iterator[Finding
     try:
         samples = _brought(node, seconds, rig)
     except (CaneflowError, OSError) as error:
-        yield Finding(node=node.name, state="bad", text=f"its driver fails: {error}")
+        attempts = ("its own words say more: caneflow run FILE", f"is {node.run} set as docs/hardware.md says?")
+        yield Finding(node=node.name, state="bad", text=f"its driver fails: {error}", attempts=attempts)
         return
     if len(samples) < 2:
-        attempts = ("more time: --seconds 10",)
+        attempts = ("more time: --seconds 10", "its own words say more: caneflow run FILE")
         text = f"{len(samples)} samples in {seconds:g} s"
         yield Finding(node=node.name, state="bad", text=text, attempts=attempts)
         return
     yield _rate(node, samples)
     last = samples[-1]
     if isinstance(last, Imu):
-        yield from _imu(node, last, [sample for sample in samples if isinstance(sample, Imu)])
+        imu = [sample for sample in samples if isinstance(sample, Imu)]
+        yield from _imu(node, last, imu) if last.orientation is not None else _raw_imu(node, imu)
+    elif isinstance(last, DopplerBlock):
+        yield from _sound(node, [sample for sample in samples if isinstance(sample, DopplerBlock)])
     elif isinstance(last, RadarFrame):
         length = last.range_start + last.range_step * last.scans.shape[1]
         text = f"{last.scans.shape[1]} range bins, {last.range_start:.2f} to {length:.2f} m"
@@ -392,7 +624,8 @@ def _rate(node: Node, samples: list[Sample]) -> Finding:
 
 def _asked_rate(node: Node) -> float | None:
     period = getattr(node.settings, "scan_period_us", 0)
-    rate: float | None = 1e6 / period if period else getattr(node.settings, "rate", None)
+    block = getattr(node.settings, "block", 0)
+    rate: float | None = 1e6 / period if period else getattr(node.settings, "rate", 1.0 / block if block else None)
     return rate
 
 
@@ -415,6 +648,43 @@ def _imu(node: Node, last: Imu, samples: list[Imu]) -> Iterator[Finding]:
         yield Finding(node=node.name, state="look" if bad else "ok", text=text, attempts=attempts)
 
 
+def _raw_imu(node: Node, samples: list[Imu]) -> Iterator[Finding]:
+    """Whether a chip without fusion of its own measures what it must at rest."""
+    gyro = np.array([sample.gyro for sample in samples])
+    accel = np.array([sample.accel for sample in samples if sample.accel is not None])
+    mag = np.array([sample.mag for sample in samples if sample.mag is not None])
+    attempts = []
+    rests = float(gyro.std(axis=0).max()) < AT_REST and len(accel) > 0
+    turn = math.degrees(float(np.linalg.norm(gyro.mean(axis=0))))
+    text = f"turns by {turn:.1f} deg/s"
+    if len(accel):
+        pull = float(np.linalg.norm(accel.mean(axis=0)))
+        text += f", feels {pull:.2f} m/s^2"
+        if rests and abs(pull - 9.81) > GRAVITY_TOLERANCE:
+            attempts.append("at rest it must feel 9.81 m/s^2: is accel_range the chip's? a board may be broken")
+    if rests and turn > MOST_BIAS:
+        attempts.append("at rest it turns: let it warm up; operators.attitude takes off what stays the same")
+    if len(mag):
+        field = float(np.linalg.norm(mag.mean(axis=0)))
+        text += f", a field of {field:.0f} uT"
+        if not FIELD[0] < field < FIELD[1]:
+            attempts.append(
+                f"the earth's field has {FIELD[0]:g} to {FIELD[1]:g} uT: away from steel and magnets, or, for what is "
+                f"worn with it, --set {node.name}.mag_offset=[x,y,z] (docs/hardware.md)"
+            )
+    elif getattr(node.settings, "magnetometer", False):
+        text += ", no field"
+        attempts.append("a magnet is too near: the magnetometer is at its end")
+    if not rests:
+        text += "; it moves"
+        attempts.append("hold it still, and look again: then more can be said")
+    yield Finding(node=node.name, state="look" if attempts else "ok", text=text, attempts=tuple(attempts))
+
+
+AT_REST = 0.05  # rad/s, standard deviation of the gyro
+MOST_BIAS = 5.0  # deg/s: the data sheet's zero-rate output
+FIELD = (20.0, 70.0)  # uT, somewhere on earth (25 to 65)
+
 TO_CALIBRATE = {
     "gyro": "gyro: lay the cane down for some seconds",
     "accelerometer": "accelerometer: hold the cane still in six positions, some seconds each",
@@ -432,4 +702,9 @@ def _gravity_apart(sample: Imu) -> float | None:
     return math.dist([9.81 * along for along in by_orientation], list(by_accel))
 
 
-CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {"drivers.bno055": _bno055, "drivers.p440": _p440}
+CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {
+    "drivers.bno055": _bno055,
+    "drivers.p440": _p440,
+    "drivers.mpu9250": _mpu9250,
+    "drivers.doppler_adc": _doppler_adc,
+}

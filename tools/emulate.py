@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterator
 from contextlib import suppress
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Annotated
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import typer
@@ -40,6 +40,52 @@ SERIAL_PORT = Path(gettempdir()) / "caneflow-bno055"
 GRAVITY = 9.81  # m/s^2
 
 
+# --- options of both --------------------------------------------------------------------------------------------
+
+
+def share(text: str) -> float:
+    """A part of a whole: `0.02` or `2%`."""
+    number = str(text)
+    try:
+        value = float(number.removesuffix("%")) * (0.01 if number.endswith("%") else 1.0)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value <= 1.0:
+        raise typer.BadParameter(f"{text!r} is no part of a whole, e.g. 0.02 or 2%")
+    return value
+
+
+def span(text: str) -> tuple[float, float]:
+    """`AT:FOR` as two numbers of s."""
+    try:
+        at, lasts = map(float, str(text).split(":"))
+    except ValueError:
+        at = lasts = math.nan
+    if not (at >= 0.0 and lasts > 0.0):
+        raise typer.BadParameter(f"{text!r} is no AT:FOR, e.g. 10:3 for 3 s from second 10 on")
+    return at, lasts
+
+
+def _part_of(what: str) -> Any:
+    return typer.Option(parser=share, metavar="PART", help=f"Part of {what}, e.g. 0.02 or 2%.")
+
+
+def _spans_in_which(what: str) -> Any:
+    return typer.Option(metavar="AT:FOR", help=f"From AT, for FOR s, {what} (may be given again).")
+
+
+Spans: TypeAlias = list[str] | None
+Begin: TypeAlias = Annotated[
+    float | None,
+    typer.Option(metavar="UNIX", help="Unix time (s) at which the recording begins; else when it is first set going."),
+]
+Seed: TypeAlias = Annotated[int, typer.Option(min=0, help="Of all faults.")]
+
+
+def _spans(texts: Spans) -> tuple[tuple[float, float], ...]:
+    return tuple(sorted(map(span, texts or ())))
+
+
 # --- BNO055 -----------------------------------------------------------------------------------------------------
 
 
@@ -51,28 +97,17 @@ def bno055(
     stream: Annotated[
         str | None, typer.Option(metavar="NODE/PORT", help="Which IMU, where the recording has several.")
     ] = None,
-    overruns: Annotated[float, typer.Option(min=0, max=1, help="Part of the requests answered by EE 07.")] = 0.0,
-    short: Annotated[float, typer.Option(min=0, max=1, help="Part of the answers that end too early.")] = 0.0,
-    freeze: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="AT:FOR", help="From AT, for FOR s or until a reset, values stand still (may be given again)."
-        ),
-    ] = None,
-    silence: Annotated[
-        list[str] | None, typer.Option(metavar="AT:FOR", help="From AT, for FOR s, it does not answer (likewise).")
-    ] = None,
-    unplug: Annotated[
-        list[str] | None, typer.Option(metavar="AT:FOR", help="From AT, for FOR s, there is no port (likewise).")
-    ] = None,
+    overruns: Annotated[float, _part_of("the requests that are answered by EE 07, bus overrun")] = 0.0,
+    loss: Annotated[float, _part_of("the requests that are never answered")] = 0.0,
+    short: Annotated[float, _part_of("the answers that end too early")] = 0.0,
+    freeze: Annotated[Spans, _spans_in_which("or until a reset, the values stand still")] = None,
+    silence: Annotated[Spans, _spans_in_which("it does not answer")] = None,
+    unplug: Annotated[Spans, _spans_in_which("there is no port and no power")] = None,
     reset: Annotated[
         list[float] | None, typer.Option(metavar="AT", help="At AT the chip starts anew by itself (likewise).")
     ] = None,
-    begin: Annotated[
-        float | None,
-        typer.Option(metavar="UNIX", help="Unix time (s) at which the recording begins; else when the chip is set up."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of all faults.")] = 1,
+    begin: Begin = None,
+    seed: Seed = 1,
 ) -> None:
     """Be a BNO055 on a UART that measures what was recorded, once, in real time. Ends with the recording.
 
@@ -80,14 +115,16 @@ def bno055(
 
     Example: caneflow emulate bno055 walk.mcap & caneflow run dataflow.yaml --set imu.port=/tmp/caneflow-bno055
     """
-    motion = _motion(recording, stream)
+    outages = list(_spans(unplug))
     faults = bno055_emulator.Faults(
         overruns=overruns,
+        loss=loss,
         short=short,
-        freezes=tuple(map(_span, freeze or ())),
-        silences=tuple(map(_span, silence or ())),
+        freezes=_spans(freeze),
+        silences=_spans(silence),
         resets=tuple(reset or ()),
     )
+    motion = _motion(recording, stream)
     now = time.monotonic()
     chip = bno055_emulator.Emulator(
         motion,
@@ -101,13 +138,14 @@ def bno055(
     try:
         plug.put_in()
         print(f"BNO055 of {recording} on {port}", flush=True)
-        _serve_bno055(chip, plug, sorted(map(_span, unplug or ())))
+        _serve_bno055(chip, plug, outages)
         print("the recording is over", flush=True)
     finally:
         plug.pull_out()
         tally = chip.tally
         print(
-            f"{tally.requests} requests, {tally.overruns} overruns, {tally.short} cut short; {tally.bursts} readings, "
+            f"{tally.requests} requests, {tally.overruns} overruns, {tally.lost} lost, {tally.short} cut short; "
+            f"{tally.bursts} readings, "
             f"of {len(motion.times)} values {len(motion.times) - len(tally.seen)} were not read",
             flush=True,
         )
@@ -174,15 +212,6 @@ def _serve_bno055(chip: bno055_emulator.Emulator, plug: _Plug, outages: list[tup
             print("plugged in again", flush=True)
 
 
-def _span(text: str) -> tuple[float, float]:
-    """`AT:FOR` as two numbers of s."""
-    try:
-        at, lasts = map(float, text.split(":"))
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is no AT:FOR, e.g. 10:3 for 3 s from second 10 on") from None
-    return at, lasts
-
-
 def _motion(path: Path, stream: str | None) -> bno055_emulator.Motion:
     """What a recording's IMU measured, as the registers of a BNO055."""
     with Recording(path) as recording:
@@ -228,23 +257,13 @@ def p440(
     stream: Annotated[
         str | None, typer.Option(metavar="NODE/PORT", help="Which radar, where the recording has several.")
     ] = None,
-    loss: Annotated[float, typer.Option(min=0, max=1, help="Part of the datagrams that get lost, both ways.")] = 0.0,
-    reorder: Annotated[
-        float, typer.Option(min=0, max=1, help="Part of the scan packets that up to 3 others overtake.")
-    ] = 0.0,
-    duplicate: Annotated[float, typer.Option(min=0, max=1, help="Part of the scan packets that come twice.")] = 0.0,
-    freeze: Annotated[
-        float | None,
-        typer.Option(metavar="AT", help="From AT on no scans come, until it is started anew."),
-    ] = None,
-    unplug: Annotated[
-        str | None, typer.Option(metavar="AT:FOR", help="From AT, for FOR s, it has no power; then it has booted.")
-    ] = None,
-    begin: Annotated[
-        float | None,
-        typer.Option(metavar="UNIX", help="Unix time (s) at which the recording begins; else with the first start."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of all faults.")] = 1,
+    loss: Annotated[float, _part_of("the datagrams that get lost, both ways")] = 0.0,
+    reorder: Annotated[float, _part_of("the scan packets that up to 3 others overtake")] = 0.0,
+    duplicate: Annotated[float, _part_of("the scan packets that come twice")] = 0.0,
+    freeze: Annotated[Spans, _spans_in_which("or until it is started anew, no scans come")] = None,
+    unplug: Annotated[Spans, _spans_in_which("it has no power; then it has booted")] = None,
+    begin: Begin = None,
+    seed: Seed = 1,
 ) -> None:
     """Be a P440 on UDP that sees what was recorded, once, in real time. Ends with the recording.
 
@@ -252,21 +271,16 @@ def p440(
 
     Example: caneflow emulate p440 walk.mcap --loss 0.02 & caneflow run dataflow.yaml --set radar.host=127.0.0.1
     """
+    faults = mrm_emulator.Faults(
+        loss=loss, reorder=reorder, duplicate=duplicate, freezes=_spans(freeze), unplugs=_spans(unplug)
+    )
     is_log = not _starts_with(recording, MCAP)
     config, moments = _moments_of_log(recording) if is_log else _moments_of_recording(recording, stream)
-    unplug_at, unplug_for = (math.inf, 0.0) if unplug is None else _span(unplug)
     radar = mrm_emulator.RadarEmulator(
         moments,
         config=config,
         random=np.random.default_rng(seed),
-        faults=mrm_emulator.Faults(
-            loss=loss,
-            reorder=reorder,
-            duplicate=duplicate,
-            freeze_at=math.inf if freeze is None else freeze,
-            unplug_at=unplug_at,
-            unplug_for=unplug_for,
-        ),
+        faults=faults,
         begin=None if begin is None else time.monotonic() + begin - time.time(),
     )
     try:

@@ -101,6 +101,3 @@ def _flow_and_key(key: str) -> tuple[str, str]:
 
 
 command = imu_csv
-
-
-command = imu_csv

@@ -125,4 +125,4 @@ def _losses(parsed: Log) -> str:
     return ", ".join(parts)
 
 
-commands = {"p440": p440, "imu-csv": "import_imu_csv"}
+commands = {"p440": p440, "imu-csv": "import_imu_csv", "wav": "import_wav"}

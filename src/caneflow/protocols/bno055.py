@@ -5,13 +5,13 @@ bytes travel is in bno055_link, what to write in which order in bno055_chip.
 """
 
 import math
-import re
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Self, TypeAlias
 
 from caneflow.protocols.errors import ProtocolError
+from caneflow.protocols.mounting import mounting
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -225,25 +225,11 @@ class Axes:
     sign: int = 0x00  # AXIS_SIGN
 
 
-_AXES = re.compile(r"([+-])([xyz])([+-])([xyz])([+-])([xyz])")
-
-
 def axes(text: str) -> Axes:
     """The remap that `text` describes: which of the chip's axes are the body's x, y and z, e.g. "-y+x+z".
 
     Raises:
         ProtocolError: no such triple, or a left-handed one.
     """
-    found = _AXES.fullmatch(text)
-    if found is None or {found[2], found[4], found[6]} != set("xyz"):
-        raise ProtocolError(f"{text!r}: the chip's axis for the body's x, y, z, each once, with sign, e.g. +x+y+z")
-    numbers = ["xyz".index(found[i]) for i in (2, 4, 6)]
-    negative = [found[i] == "-" for i in (1, 3, 5)]
-    if (sum(negative) + _swaps(numbers)) % 2:
-        raise ProtocolError(f"{text!r}: is a left-handed system, which no way of mounting makes; turn one sign round")
-    x, y, z = numbers
-    return Axes(map=z << 4 | y << 2 | x, sign=negative[0] << 2 | negative[1] << 1 | negative[2])
-
-
-def _swaps(order: list[int]) -> int:
-    return sum(order[i] > order[j] for i in range(3) for j in range(i + 1, 3))
+    (x, y, z), (sx, sy, sz) = mounting(text)
+    return Axes(map=z << 4 | y << 2 | x, sign=(sx < 0) << 2 | (sy < 0) << 1 | (sz < 0))

@@ -18,8 +18,8 @@ from caneflow.protocols.bno055 import (
     Mode,
     Register,
 )
-from caneflow.protocols.bno055_link import Link, Received
 from caneflow.protocols.errors import ProtocolError
+from caneflow.protocols.register_link import Link, Received
 
 # Of the tables' times, which are typical ones.
 MARGIN = 0.003  # s

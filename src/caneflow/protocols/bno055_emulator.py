@@ -67,6 +67,7 @@ class Faults:
     """What goes wrong. Times are s from the beginning of the motion."""
 
     overruns: float = 0.0  # part of all requests that are answered by EE 07
+    loss: float = 0.0  # part of all requests that are never answered
     short: float = 0.0  # part of all answers that end before their last bytes
     freezes: tuple[Span, ...] = ()  # the values stand still, unless there is a reset
     silences: tuple[Span, ...] = ()  # no answer
@@ -79,6 +80,7 @@ class Tally:
 
     requests: int = 0
     overruns: int = 0
+    lost: int = 0
     short: int = 0
     bursts: int = 0  # readings of the measurements
     seen: set[int] = field(default_factory=set)  # which of the motion's values were read
@@ -191,6 +193,9 @@ class Emulator:
         if now < self._deaf_until or self._within(self._faults.silences, now) is not None:
             return
         self.tally.requests += 1
+        if self._faults.loss and self._rng.random() < self._faults.loss:
+            self.tally.lost += 1
+            return
         if now < self._busy_until or self._rng.random() < self._faults.overruns:
             self.tally.overruns += 1
             self._say(bytes([ACKNOWLEDGE, Status.BUS_OVERRUN]), now)

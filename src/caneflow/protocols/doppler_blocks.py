@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from caneflow.protocols.errors import ProtocolError
 
-Samples: TypeAlias = NDArray[np.int16] | NDArray[np.float32] | NDArray[np.complex64]
+Samples: TypeAlias = NDArray[np.int16 | np.float32 | np.complex64]
 FULL_SCALE = np.float32(2**15)  # of int16
 
 

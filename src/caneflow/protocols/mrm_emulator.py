@@ -6,9 +6,10 @@ while it is stopped are never sent.
 """
 
 import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -25,6 +26,7 @@ LONGEST_REORDERED_MS = 2000  # a clock that goes back further was started anew; 
 READY_ID = 0
 
 Chance = Annotated[float, Ge(0), Le(1)]
+Span: TypeAlias = tuple[float, float]  # s from the beginning of the recording, and s that it lasts
 
 
 class Moment(NamedTuple):
@@ -36,14 +38,13 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """What goes wrong, and how often; times are those of the recording."""
+    """What goes wrong, and how often; spans of one kind do not overlap."""
 
     loss: Chance = 0.0  # of each datagram, in either direction
     reorder: Chance = 0.0  # of each scan packet: up to MOST_OVERTAKING others arrive before it
     duplicate: Chance = 0.0  # of each scan packet
-    freeze_at: float = math.inf  # s: from here on silent until it is started anew, but it answers
-    unplug_at: float = math.inf  # s: from here on dead ...
-    unplug_for: float = 3.0  # s: ... until its power comes back: it has booted, and does not scan
+    freezes: tuple[Span, ...] = ()  # it answers, but no scans come, unless it is started anew
+    unplugs: tuple[Span, ...] = ()  # no power; then it has booted, and does not scan
 
 
 @dataclass(kw_only=True, slots=True)
@@ -75,6 +76,7 @@ class _State:
     config: RadarConfig
     booted_at: float = 0.0  # s of the recording
     scanning: bool = False
+    frozen: bool = False
     mode: int = mrm.MODE_MRM
     sleep: int = mrm.SLEEP_ACTIVE
     held: list[_Held] = field(default_factory=list)
@@ -108,13 +110,14 @@ class RadarEmulator:
         self._faults = faults or Faults()
         self._begin = begin
         self._confirms_stop = confirms_stop
-        self._frozen = False  # has been: it freezes once
-        self._was_unplugged = False
+        self._freezes = deque(sorted(self._faults.freezes))  # that are not over
+        self._unplugs = deque(sorted(self._faults.unplugs))
+        self._freezing: float | None = None  # s, the beginning of the freeze that was last suffered
 
     @property
     def scanning(self) -> bool:
         """Whether it sends scans."""
-        return self._state.scanning
+        return self._state.scanning and not self._state.frozen
 
     @property
     def over(self) -> bool:
@@ -140,7 +143,7 @@ class RadarEmulator:
     def send_due(self, now: float) -> list[bytes]:
         """What it sends unasked until `now`, in the order of sending."""
         out = self._suffered(now)
-        while self._state.scanning and self._next is not None and self._next.time <= self._time(now):
+        while self.scanning and self._next is not None and self._next.time <= self._time(now):
             self.counts.scans += 1
             out += self._scan_packets(self._next.packets, now)
             self._next = next(self._moments, None)
@@ -153,9 +156,7 @@ class RadarEmulator:
         if self._begin is not None:
             if self._next is not None:
                 due.append(self._begin + self._next.time)
-            back = self._faults.unplug_at + self._faults.unplug_for
-            if self._time(now) < back < math.inf:
-                due.append(self._begin + back)
+            due += [self._begin + at + lasts for at, lasts in self._unplugs]
         return min(due, default=None)
 
     def _time(self, now: float) -> float:
@@ -163,26 +164,33 @@ class RadarEmulator:
         return -math.inf if self._begin is None else now - self._begin
 
     def _is_unplugged(self, now: float) -> bool:
-        faults = self._faults
-        return faults.unplug_at <= self._time(now) < faults.unplug_at + faults.unplug_for
+        return any(at <= self._time(now) < at + lasts for at, lasts in self._unplugs)
 
     def _suffered(self, now: float) -> list[bytes]:
         """Take the faults whose time has come; what is sent on account of them."""
-        if self._time(now) >= self._faults.freeze_at and not self._frozen:
-            self._frozen = True
-            self._state.scanning = False
+        time = self._time(now)
+        self._freeze(time)
         if self._is_unplugged(now):
-            self._was_unplugged = True
             self._state = _State(self._factory)
-        elif self._was_unplugged:
-            self._was_unplugged = False
-            self._state.booted_at = self._time(now)
+        if self._unplugs and time >= sum(self._unplugs[0]):
+            self._unplugs.popleft()
+            self._state = _State(self._factory, booted_at=time)
             return self._through_the_link([mrm.build(mrm.ReadyInfo(message_id=READY_ID))])
         return []
 
+    def _freeze(self, time: float) -> None:
+        while self._freezes and time >= self._freezes[0][0]:
+            at, lasts = self._freezes[0]
+            if time < at + lasts:
+                self._state.frozen = self._state.frozen or self._freezing != at
+                self._freezing = at
+                return
+            self._freezes.popleft()
+            self._state.frozen = False
+
     def _pass_unseen(self, now: float) -> None:
         """Let the world go on up to `now`: what the radar does not see is not sent later."""
-        while self._next is not None and self._next.time < self._time(now) and not self._state.scanning:
+        while self._next is not None and self._next.time < self._time(now) and not self.scanning:
             self._next = next(self._moments, None)
 
     # --- requests -----------------------------------------------------------------------------------------------
@@ -238,7 +246,7 @@ class RadarEmulator:
         if status == mrm.STATUS_OK and count:
             self._begin = now if self._begin is None else self._begin
             self._pass_unseen(now)
-            self._state.scanning = True
+            self._state.scanning, self._state.frozen = True, False
         elif not count:
             self._state.scanning = False
             self._state.held.clear()

@@ -37,6 +37,8 @@ class Stream:
     count: int  # samples
     first_stamp: int | None  # ns; None when there is no sample
     last_stamp: int | None  # ns
+    first_seq: int | None = None
+    last_seq: int | None = None
 
 
 class Recorded(NamedTuple):
@@ -195,7 +197,7 @@ class Recording:
                 raise RecordingError(
                     f"{self.path}: both {streams[node, port].key} and {key} are in it; a recording is of one flow"
                 )
-            first, last = self._ends(key)
+            (first, first_seq), (last, last_seq) = self._ends(key)
             streams[node, port] = Stream(
                 key=key,
                 node=node,
@@ -204,6 +206,8 @@ class Recording:
                 count=self._layout.counts[key],
                 first_stamp=first,
                 last_stamp=last,
+                first_seq=first_seq,
+                last_seq=last_seq,
             )
         return streams, others
 
@@ -214,11 +218,13 @@ class Recording:
             topics.setdefault(channel.topic, channel)
         return topics
 
-    def _ends(self, key: str) -> tuple[int | None, int | None]:
+    def _ends(self, key: str) -> tuple[tuple[int, int] | tuple[None, None], tuple[int, int] | tuple[None, None]]:
+        """Stamp and seq of the first and the last sample, found without reading what lies between."""
         blocks = self._blocks(key)
         if not blocks:
-            return None, None
-        return self._content(blocks[0]).messages[key][0][0], self._last(blocks[-1], key)
+            return (None, None), (None, None)
+        first, last = self._content(blocks[0]).messages[key][0], self._content(blocks[-1]).messages[key][-1]
+        return first[:2], last[:2]
 
     def _last(self, block: Block, key: str) -> int:
         """Stamp of the last sample of `key` in `block`, which is kept: a search looks at few blocks many times."""

@@ -44,8 +44,12 @@ class RecordingWriter:
         rig: dict[str, Any],
         run: str | None = None,
         compression: Compression = "zstd",
+        part: int | None = None,
     ) -> None:
+        """`part`: which of the files of one run this is."""
         about = {"flow": flow, "version": FORMAT_VERSION, "run": run or uuid.uuid4().hex, "source": source}
+        if part is not None:
+            about["part"] = str(part)
         bolted_on = {"json": json.dumps(rig, allow_nan=False)}
         self.path = Path(path)
         self._channels: dict[str, tuple[int, str]] = {}  # by key: channel id, name of its schema
@@ -72,6 +76,11 @@ class RecordingWriter:
         """Add what the flow said about itself under `<flow>/@/...`: a msgpack map of no fixed shape."""
         with self._ending_at_failure():
             self._add(self._channel(key, schema_name, None), payload, log_time, 0, log_time)
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far; up to FLUSH_INTERVAL of samples come on top."""
+        return self._file.tell()
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system, where it outlives this process."""

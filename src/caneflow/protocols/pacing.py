@@ -1,6 +1,6 @@
-"""When to read a BNO055 so that each of its values is read once. No clock: the time is told.
+"""When to read a chip so that each of its values is read once. No clock: the time is told.
 
-The chip does not say when it has new values, nor counts them, and its 100 Hz are not the host's. So it is read a
+The chip does not say when it has new values, nor counts them, and its rate is not quite the host's. So it is read a
 little more often than it has new values, each time a little earlier after they came. When they had not yet come, it
 is read again at once, and the next readings are moved a bit behind: thus they stay within MARGIN of the change.
 """
@@ -8,12 +8,11 @@ is read again at once, and the next readings are moved a bit behind: thus they s
 import math
 from enum import Enum, auto
 
-from caneflow.protocols.bno055 import RATE
-
-FASTER = 1.01  # readings for each value: a chip that is that much too fast still loses none
+FASTER = 1.01  # readings for each value
 MARGIN = 0.002  # s behind the change of the values, to which a reading that came too early moves the others
 AGAIN_AFTER = 0.001  # s
-FROZEN_AFTER = 1.0  # s of the very same values: noise alone changes some of the 22 numbers every time
+QUICKEST = 0.2  # intervals that MARGIN takes at most; AGAIN_AFTER half of them
+FROZEN_AFTER = 1.0  # s of the very same values: noise alone changes some of the numbers every time
 GAP = 5.0  # intervals
 
 
@@ -28,11 +27,17 @@ class Verdict(Enum):
 class Pacing:
     """The times of the readings, s on a clock that does not jump."""
 
-    def __init__(self, rate: float, start: float) -> None:
-        """`rate` Hz; below the chip's own the readings simply keep it, and leave values out."""
+    def __init__(self, rate: float, start: float, *, chip_rate: float, faster: float = FASTER) -> None:
+        """`rate` Hz; below the chip's own, `chip_rate`, the readings simply keep it, and leave values out.
+
+        `faster`: readings for each value; a chip that is faster than it says by less loses none.
+        """
         self.missed = 0  # readings that were not made because the one before took too long
         self.repeated = 0
-        self._step = 1.0 / (rate * FASTER if rate >= RATE else rate)
+        self._chip_rate = chip_rate
+        self._margin = min(MARGIN, QUICKEST / chip_rate)
+        self._again_after = min(AGAIN_AFTER, 0.5 * QUICKEST / chip_rate)
+        self._step = 1.0 / (rate * faster if rate >= chip_rate else rate)
         self._values = b""
         self._changed = start
         self.restart(start)
@@ -48,12 +53,12 @@ class Pacing:
         again, self._again = self._again, False
         if values != self._values:
             self._values, self._changed = values, now
-            self._go_on(now, later=MARGIN if again else 0.0)
+            self._go_on(now, later=self._margin if again else 0.0)
             return Verdict.NEW
-        if self._step < 1.0 / RATE and not again:
+        if self._step < 1.0 / self._chip_rate and not again:
             self.repeated += 1
             self._again = True
-            self.due = now + AGAIN_AFTER
+            self.due = now + self._again_after
             return Verdict.REPEATED
         # Twice the same: new values have come by now, so they are equal.
         self._go_on(now)

@@ -1,0 +1,65 @@
+"""Radar frames as pictures for other programs: the range-Doppler map of what moves, in grey."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
+from caneflow.algorithms.range_doppler import SlowTimeWindow, hann, range_doppler_map, speed_limit
+from caneflow.messages import RadarFrame
+
+SCANS = 64  # in one map: 0.64 s at 100 Hz
+PERIOD = 100_000_000  # ns between two pictures: a map changes little within it
+SPAN = 40.0  # dB from black to white
+FADE = 0.9  # how much of the greatest power seen is left after each picture
+
+
+class MapImage(NamedTuple):
+    """One range-Doppler map: rows are radial speeds, the fastest approach on top; columns are ranges, near first."""
+
+    stamp: int  # ns, of the newest scan in it
+    grey: NDArray[np.uint8]  # shape (SCANS, M); 255 is the greatest power of late, 0 is SPAN dB below it
+    fastest: float  # m/s at the upper edge; the lower edge is as fast the other way
+    nearest: float  # m, of the first column
+    range_step: float  # m between columns
+
+
+class RadarImages:
+    """The frames of one stream into one picture per PERIOD."""
+
+    def __init__(self) -> None:
+        self._returns = MovingReturnsFilter(MovingReturnsSettings())
+        self._weights = hann(SCANS)
+        self._window: SlowTimeWindow | None = None
+        self._filled = 0  # scans
+        self._next_ns = 0
+        self._greatest = 0.0
+
+    def take(self, frame: RadarFrame) -> MapImage | None:
+        """The picture up to `frame`, if one is due; raises ValueError for a frame of which none can be made."""
+        parameters = RadarParameters(
+            scan_period=frame.scan_period,
+            range_start=frame.range_start,
+            range_step=frame.range_step,
+            carrier=frame.carrier,
+            bandwidth=frame.bandwidth,
+        )
+        returns = self._returns.update(frame.stamp, frame.scans, parameters)
+        if returns.restarted or self._window is None:
+            self._window, self._filled = SlowTimeWindow(length=SCANS, bins=frame.scans.shape[1]), 0
+        for scan in returns.scans:
+            self._window.push(scan)
+        self._filled += len(returns.scans)
+        if self._filled < SCANS or frame.stamp < self._next_ns:
+            return None
+        self._next_ns = frame.stamp + PERIOD
+        fastest = speed_limit(scan_period=frame.scan_period, carrier=frame.carrier)
+        return MapImage(frame.stamp, self._grey(self._window), fastest, frame.range_start, frame.range_step)
+
+    def _grey(self, window: SlowTimeWindow) -> NDArray[np.uint8]:
+        power = np.abs(range_doppler_map(window.view(), self._weights, SCANS)) ** 2
+        self._greatest = max(FADE * self._greatest, float(power.max()), float(np.finfo(np.float32).tiny))
+        below = 10 * np.log10(np.maximum(power / self._greatest, 10 ** (-SPAN / 10)))  # dB, -SPAN .. 0
+        grey = np.rint(255 * (1 + below / SPAN)).astype(np.uint8)
+        return np.ascontiguousarray(np.fft.fftshift(grey, axes=1).T[::-1])
