@@ -2,7 +2,7 @@
 
 in   frame : RadarFrame   one scan per 10 ms
 in   imu   : Imu          orientation and gyro
-out  speed : GroundSpeed  one per frame
+out  speed : GroundSpeed  one per frame; `velocity` in every fifth (ground_velocity.every)
 """
 
 import math

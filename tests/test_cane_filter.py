@@ -188,6 +188,56 @@ def test_a_heading_that_cannot_be_known_shows_in_the_covariance() -> None:
     assert final_error(walk, estimates) < 3.0 * spread
 
 
+def test_the_final_error_is_of_the_size_that_the_covariance_says() -> None:
+    """Loops with gyro biases of sd 0.1 deg/s in rooms with 14 deg of field errors; the radar's noise is white here.
+
+    The long test in test_cane_filter_walks.py does it on simulated radar, which is less kind.
+    """
+    squares = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        waves, phases = rng.normal(0.0, 1 / 1.8, (4, 2)), rng.uniform(0.0, 2 * math.pi, 4)
+        north = 14 * DEGREE * math.sqrt(0.5) * np.sin(loop().truth @ waves.T + phases).sum(axis=1)
+        walk = loop(gyro_bias=rng.normal(0.0, 0.1) * DEGREE, north=north - north[0], noise=0.05, seed=seed)
+        _, estimates = run(walk)
+        covariance = estimates[-1].covariance
+        assert covariance is not None
+        error = np.array(estimates[-1].position[:2]) - walk.truth[-1]
+        squares.append(float(error @ np.linalg.solve(covariance[:2, :2], error)))
+    assert 0.3 < np.mean(squares) < 3.5  # chi-square of 12 degrees of freedom over 6: 0.73 to 3.9, 19 times in 20
+    assert max(squares) < 9.2
+
+
+def test_a_correction_is_followed_without_a_jump() -> None:
+    """Each radar velocity moves the position by up to a millimetre; taken at once, that makes the track longer."""
+    walk = loop(noise=0.1)
+    excess = []
+    for time in (0.3, 1e-6):
+        _, estimates = run(walk, settings=CaneFilterSettings(correction_time=time))
+        assert final_error(walk, estimates) < 0.5
+        track = np.array([e.position[:2] for e in estimates])
+        excess.append(float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum()) - float(walk.speeds.sum() * 0.01))
+    assert 0.0 < excess[0] < 0.5 * excess[1]
+
+
+def test_velocities_that_come_more_often_are_worth_less_each() -> None:
+    """What is published at 20 or at 100 Hz says the same of the position's variance, to a third."""
+    way = np.zeros(1000)
+    walk = Walk(yaws=way, headings=way, speeds=np.full(1000, 0.5), noise=0.05)
+    spreads = []
+    for every in (1, 5):
+        cane = CaneFilter(CaneFilterSettings(), boresight=BORESIGHT, pivot=PIVOT)
+        for index in range(len(walk.yaws)):
+            stamp_ns = START_NS + index * PERIOD_NS
+            accel = rotate(conjugate(held(0.0)), (0.0, 0.0, GRAVITY))
+            estimate = cane.imu(stamp_ns, (0.0, 0.0, 0.0), accel, held(0.0), None)
+            if index % every == 0:
+                cane.velocity(stamp_ns, (0.5, 0.0), (0.0025, 0.0, UNOBSERVED), 0.025)
+        assert estimate.covariance is not None
+        spreads.append(math.sqrt(estimate.covariance[3, 3]))
+    assert spreads[0] == pytest.approx(spreads[1], rel=0.33)
+
+
 def test_the_covariance_is_a_covariance() -> None:
     _, estimates = run(loop(noise=0.05))
     for estimate in estimates[::50]:

@@ -57,8 +57,8 @@ def ground(forward: float, *, scans: int, noise: float = 0.0, height: float = HE
 def run(
     scans: Scans, *, settings: GroundVelocitySettings | None = None, turn_rate: float = 0.0, rise: float | None = None
 ) -> tuple[GroundVelocityEstimator, list[VelocityEstimate]]:
-    """Estimates for `scans`; with `rise` an accelerometer that saw the start of a lift at that speed."""
-    estimator = GroundVelocityEstimator(settings or GroundVelocitySettings(), GEOMETRY)
+    """Estimates for each of `scans`; with `rise` an accelerometer that saw the start of a lift at that speed."""
+    estimator = GroundVelocityEstimator(settings or GroundVelocitySettings(every=1), GEOMETRY)
     attitudes = AttitudeHistory()
     estimates = []
     for index, scan in enumerate(scans):
@@ -68,7 +68,9 @@ def run(
             jolt = rise / 0.01 if index == 1 else 0.0
             up = 9.80665 + jolt
             estimator.imu(stamp_ns, HELD, (0.0, -up * math.sin(PITCH), up * math.cos(PITCH)))
-        estimates.append(estimator.update(returns_of(scan, index), attitudes))
+        estimate = estimator.update(returns_of(scan, index), attitudes)
+        if estimate is not None:
+            estimates.append(estimate)
     return estimator, estimates
 
 
@@ -134,10 +136,25 @@ def test_learns_that_the_hand_is_lower_than_the_rig_says() -> None:
 
 
 def test_without_an_attitude_there_is_nothing() -> None:
-    estimator = GroundVelocityEstimator(GroundVelocitySettings(), GEOMETRY)
+    estimator = GroundVelocityEstimator(GroundVelocitySettings(every=1), GEOMETRY)
     scans = ground(0.45, scans=8)
     estimates = [estimator.update(returns_of(scan, i), AttitudeHistory()) for i, scan in enumerate(scans)]
-    assert not any(estimate.valid for estimate in estimates)
+    assert not any(estimate is None or estimate.valid for estimate in estimates)
+
+
+@pytest.mark.parametrize("every", [1, 3, 5])
+def test_an_estimate_every_few_frames_is_the_one_of_every_frame(every: int) -> None:
+    scans = ground(0.45, scans=30, noise=0.2)
+    _, each = run(scans)
+    estimator = GroundVelocityEstimator(GroundVelocitySettings(every=every), GEOMETRY)
+    attitudes = AttitudeHistory()
+    for index, scan in enumerate(scans):
+        attitudes.add(START_NS + index * PERIOD_NS, HELD, (0.0, 0.0, 0.0))
+        estimate = estimator.update(returns_of(scan, index), attitudes)
+        assert (estimate is not None) == ((index + 1) % every == 0)
+        if estimate is not None and estimate.valid:
+            # the height's error has been learnt from fewer frames
+            assert estimate.velocity[0] == pytest.approx(each[index].velocity[0], abs=0.002)
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:

@@ -47,7 +47,10 @@ def command(
     ],
     methods: Annotated[
         str | None,
-        typer.Option(metavar="NAME,...", help="What to compare; by default all that fusion offers."),
+        typer.Option(
+            metavar="NAME,...",
+            help="What to compare; by default all that fusion offers. Also: smoothed, best in hindsight.",
+        ),
     ] = None,
     flow: Annotated[Path, typer.Option(metavar="FILE", help="The dataflow.")] = Path("dataflow.yaml"),
     settings: Annotated[

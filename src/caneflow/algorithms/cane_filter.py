@@ -34,8 +34,9 @@ from caneflow.algorithms.walk_motion import WalkMotion, WalkMotionSettings
 class CaneFilterSettings:
     """What the filter may be told; units on each line."""
 
-    # a radar velocity errs alike for 0.1 s (its window, and the speckle it stands on): as white noise, so much more
-    velocity_inflation: Annotated[float, Gt(0)] = 6.0
+    # s over which radar velocities err alike (their window, and the speckle they stand on): as white noise, those
+    # that come more often are worth less each
+    velocity_correlation: Annotated[float, Gt(0)] = 0.04
     speed_noise: Annotated[float, Gt(0)] = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
     speed_patience: Annotated[float, Gt(0)] = 0.5  # s without a velocity before the paper's speed is taken instead
     sideways: Annotated[float, Gt(0)] = 0.1  # m/s, sd of the hand's velocity across the way the cane points
@@ -48,6 +49,8 @@ class CaneFilterSettings:
     radar_standing: Annotated[float, Gt(0)] = 0.2  # m/s, radar speed above which nobody stands, whatever the IMU says
     speed_scale: Annotated[float, Ge(0)] = 0.012  # sd of the radar's scale: 1 cm of height; only in the covariance
     heading_interval: Annotated[float, Gt(0)] = 0.1  # s between updates of the tracks
+    # s in which the track follows a correction: a person does not jump by millimetres twenty times a second
+    correction_time: Annotated[float, Gt(0)] = 0.3
     standing: StandingSettings = field(default_factory=StandingSettings)
     motion: WalkMotionSettings = field(default_factory=WalkMotionSettings)
     heading: HeadingSettings = field(default_factory=HeadingSettings)
@@ -114,6 +117,7 @@ class CaneFilter:
         self._radar_speed = 0.0  # m/s, the last
         self._field: Vector | None = None  # uT, body
         self._since_heading = self._since_sideways = 0.0  # s
+        self._correction = 0j  # m in the gyro's frame, by which the track has yet to move
 
     @property
     def gaps(self) -> int:
@@ -135,8 +139,7 @@ class CaneFilter:
         last_ns = self._last_velocity_ns
         if not valid or (last_ns is not None and stamp_ns - last_ns < self._settings.speed_patience * 1e9):
             return
-        variance = self._settings.speed_noise**2 / self._settings.velocity_inflation
-        self._waiting.append(_Measured(stamp_ns, delay or 0.0, speed, 0.0, variance, math.inf))
+        self._waiting.append(_Measured(stamp_ns, delay or 0.0, speed, 0.0, self._settings.speed_noise**2, math.inf))
 
     def velocity(
         self,
@@ -148,8 +151,13 @@ class CaneFilter:
         """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
         (forward, left), (xx, _, yy) = velocity, covariance
         if min(xx, yy) < _UNOBSERVED:
+            share = 1.0
+            if self._last_velocity_ns is not None:
+                since = (stamp_ns - self._last_velocity_ns) * 1e-9
+                share = min(since / self._settings.velocity_correlation, 1.0)
             self._last_velocity_ns = stamp_ns
-            self._waiting.append(_Measured(stamp_ns, delay or 0.0, forward, left, xx, yy))
+            if share > 0.0:
+                self._waiting.append(_Measured(stamp_ns, delay or 0.0, forward, left, xx / share, yy / share))
 
     def magnetic_field(self, mag: Vector) -> None:
         """Take the field (uT, body frame) of the IMU sample that comes next."""
@@ -178,15 +186,18 @@ class CaneFilter:
         self._yaw.update(interval, orientation, gyro, chip_cos, chip_sin)
         turn = cmath.rect(1.0, self._yaw.offset)  # from the chip's frame to the gyro's
         facing = turn * complex(chip_cos, chip_sin)
-        before = self._motion.position
+        before = complex(*self._motion.position)
         self._predict(elapsed, interval, turn * complex(*in_chips_frame[:2]), facing)
+        moved = complex(*self._motion.position) - before
         turned = self._pointing.update(interval, cmath.phase(facing))
         self._remember(stamp_ns, turn, facing, orientation, gyro)
         self._take_velocities(stamp_ns)
         self._use_gait(interval, stands, turn, orientation, gyro)
-        after = self._motion.position
+        self._correction += complex(*self._motion.position) - before - moved
+        shown = self._correction * min(elapsed / self._settings.correction_time, 1.0)
+        self._correction -= shown
 
-        self.heading.move(elapsed, turned, after[0] - before[0], after[1] - before[1])
+        self.heading.move(elapsed, turned, moved.real + shown.real, moved.imag + shown.imag)
         self._see_field(orientation)
         self._since_heading += elapsed
         if self._since_heading >= self._settings.heading_interval:
@@ -224,8 +235,7 @@ class CaneFilter:
             for direction, value, variance in sides:
                 if variance < _UNOBSERVED:
                     moved = (since * direction.conjugate()).real
-                    noise = variance * self._settings.velocity_inflation
-                    self._motion.observe_velocity((direction.real, direction.imag), value + moved, noise)
+                    self._motion.observe_velocity((direction.real, direction.imag), value + moved, variance)
             self._radar_speed = measured.forward
 
     def _instant(self, stamp_ns: int) -> _Instant:

@@ -66,8 +66,10 @@ class RayCaster:
         self._start, self._step = range_start, range_step
         self._nearest, self._farthest = range_start, range_start + (bins - 1) * range_step
         self._shares = np.linspace(0.0, 1.0, fan.rays + 2)
+        self._steepest = math.sin(fan.steepest) ** 2
         ranges = range_of_bin(np.arange(bins), start=range_start, step=range_step)
-        self._squares: list[float] = (ranges**2).tolist()  # m^2, of each bin
+        with np.errstate(divide="ignore"):  # no ray has range 0
+            self._inverse_squares: list[float] = (1.0 / ranges**2).tolist()  # 1/m^2, of each bin
 
     def cast(self, *, height: float, axis: float) -> Rays:
         """The rays of an antenna at `height` m whose beam points `axis` rad (alpha0) below the horizontal.
@@ -82,10 +84,13 @@ class RayCaster:
         first, last = max(near, self._nearest), min(far, self._farthest)
         if last - first < 0.5 * (far - near):
             return NO_RAYS
-        scaled = self._shares * ((last - first) / self._step) + ((first - self._start) / self._step + 0.5)
+        scaled = self._shares * ((last - first) / self._step)
+        scaled += (first - self._start) / self._step + 0.5
         rows = scaled.astype(np.intp)
         # A ray's angle is that of its bin's centre: rounding would cost up to 2 % of speed at steep angles.
         # Plain Python: for a handful of numbers, numpy's calls cost more.
-        square, steepest, squares = height * height, math.sin(fan.steepest) ** 2, self._squares
-        cosines = [math.sqrt(1.0 - min(square / squares[row], steepest)) for row in rows.tolist()]
-        return Rays(rows=rows, cosines=cosines[1:-1])
+        square, steepest, inverse, root = height * height, self._steepest, self._inverse_squares, math.sqrt
+        bins = rows.tolist()[1:-1]
+        if square * inverse[bins[0]] <= steepest:  # the nearest ray is the steepest
+            return Rays(rows=rows, cosines=[root(1.0 - square * inverse[row]) for row in bins])
+        return Rays(rows=rows, cosines=[root(1.0 - min(square * inverse[row], steepest)) for row in bins])

@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 UNOBSERVED: Final = 1e6  # (m/s)^2, variance of a component that is not observed (wire.md)
-_FIRST_SPEEDS: Final = np.arange(-2.0, 4.1, 0.4)  # m/s, near enough to each other for the nearest to be the best
+_LOWEST_SPEED, _SPEED_STEP, _SPEEDS = -2.0, 0.4, 16  # m/s to begin with; so near that the nearest is the best
 _MOST_COHERENT: Final = 0.96  # squared coherence above which noise is not what limits a cell
 _FAINT: Final = 1e-30  # power of nothing
 _HEAVES: Final = 64  # IMU samples that a window's middle may lie back
@@ -41,6 +41,7 @@ class GroundVelocitySettings:
     """What the pulse pair may be told."""
 
     window: Annotated[int, Ge(2)] = 5  # pairs of scans in a sum
+    every: Annotated[int, Ge(1)] = 5  # frames from one estimate to the next: windows that overlap err alike
     cell: Annotated[float, Gt(0)] = 0.075  # m of range in a sum: the pulse is 0.09 m long
     shallowest: Annotated[float, Gt(0)] = math.radians(16)  # rad, grazing angle
     steepest: Annotated[float, Lt(math.pi / 2)] = math.radians(75)  # rad
@@ -54,7 +55,7 @@ class GroundVelocitySettings:
     heave_error: Annotated[float, Gt(0)] = 0.02  # m/s, sd of the vertical speed with one
     height_error: Annotated[float, Gt(0)] = 0.03  # m, sd of a person's hand about the rig's height
     height_walk: Annotated[float, Ge(0)] = 0.002  # m / sqrt(s)
-    height_looks: Annotated[float, Gt(0)] = 50.0  # frames that tell the height as much as one would if independent
+    height_time: Annotated[float, Gt(0)] = 0.5  # s that tell the height as much as one estimate would by itself
     rest_turn_rate: Annotated[float, Gt(0)] = math.radians(5.0)  # rad/s, mean norm, below which nothing seen is rest
     rest_speed: Annotated[float, Gt(0)] = 0.03  # m/s, sd of the antenna's then: drift and tremor of a hand
     heave: HeaveSettings = field(default_factory=HeaveSettings)
@@ -114,6 +115,7 @@ class GroundVelocityEstimator:
         self._settings = settings
         self._geometry = geometry
         self._window = PulsePairWindow(window=settings.window, cell=settings.cell)
+        self._frames = 0  # since the last estimate
         self._heave = HeaveObserver(settings.heave)
         self._heaves: deque[tuple[int, float, float]] = deque(maxlen=_HEAVES)  # stamp, height, rate
         self._height_error = 0.0  # m, to be added to the rig's
@@ -136,14 +138,18 @@ class GroundVelocityEstimator:
         self._heave.update(elapsed, rise, antenna_height(self._geometry, orientation))
         self._heaves.append((stamp_ns, self._heave.height, self._heave.rate))
 
-    def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> VelocityEstimate:
-        """The estimate after one more frame.
+    def update(self, returns: MovingReturns, attitudes: AttitudeHistory) -> VelocityEstimate | None:
+        """The estimate after one more frame; None where none is due.
 
         Not valid while the window is not full, without an attitude in its middle, where the beam shows too little
         ground or ground that does not move as one, and near the limit of unambiguous Doppler.
         """
         settings = self._settings
         self._window.push(returns)
+        self._frames += 1
+        if self._frames < settings.every:
+            return None
+        self._frames = 0
         interval = self._window.interval_ns()
         if interval is None:
             return _nothing(0.5 * settings.window * returns.parameters.scan_period)
@@ -169,7 +175,7 @@ class GroundVelocityEstimator:
             return _nothing(delay)
         if float(cells.per_forward.max()) * abs(fit.forward) > settings.alias_share * math.pi:
             return _nothing(delay)
-        self._learn_height(fit, returns.parameters.scan_period * len(returns.scans))
+        self._learn_height(fit, 2 * delay / settings.window * len(returns.scans) * settings.every)
         return VelocityEstimate(
             velocity=(fit.forward, 0.0),
             covariance=(fit.forward_variance, 0.0, UNOBSERVED),
@@ -221,8 +227,12 @@ class GroundVelocityEstimator:
         np.minimum(square, _MOST_COHERENT, out=square)
         weight = square / (1.0 - square)
         weight *= 2.0 * settings.looks
-        turned = np.exp(_FIRST_SPEEDS[:, None] * (-1j * cells.per_forward))
-        forward = float(_FIRST_SPEEDS[np.einsum("ik,k->i", turned, pairs).real.argmax()])
+        # the pairs turned back by each of the speeds to begin with, one more step for every row
+        turned = np.empty((_SPEEDS, len(pairs)), np.complex128)
+        turned[0] = pairs * np.exp(cells.per_forward * (-1j * _LOWEST_SPEED))
+        turned[1:] = np.exp(cells.per_forward * (-1j * _SPEED_STEP))
+        np.multiply.accumulate(turned, out=turned)
+        forward = _LOWEST_SPEED + _SPEED_STEP * int(np.add.reduce(turned.real, axis=1).argmax())
         phase = np.angle(pairs * np.exp(cells.per_forward * (-1j * forward))) + cells.per_forward * forward
         vertical = height = 0.0
         residual = phase - cells.per_forward * forward
@@ -248,7 +258,8 @@ class GroundVelocityEstimator:
             return
         seen = fit.height * (1.0 + 1.0 / (information * before))  # what the frame alone would say
         before += settings.height_walk**2 * elapsed
-        gain = before * information / (settings.height_looks + before * information)
+        looks = max(settings.height_time / elapsed, 1.0)
+        gain = before * information / (looks + before * information)
         self._height_error += gain * seen
         self._height_variance = before * (1.0 - gain)
 

@@ -180,10 +180,11 @@ class PaperSpeed:
         """
         settings = self._settings
         half = settings.transform // 2
-        approaching = power[:, : half + 1]
-        edges, falls = superior_edges(np.sqrt(approaching))
-        peaks = np.maximum.reduce(approaching, axis=1)
-        least_peak, last_edge, beyond = settings.least_peak * floor, settings.alias_share * half, self._beyond
+        magnitudes = np.sqrt(power[:, : half + 1])
+        edges, falls = superior_edges(magnitudes)
+        peaks = np.maximum.reduce(magnitudes, axis=1)
+        least_peak = math.sqrt(settings.least_peak * floor)
+        last_edge, beyond = settings.alias_share * half, self._beyond
         speeds, heights, ambiguous = [], [], 0
         # Plain Python from here on: for a handful of numbers, numpy's calls cost more.
         for edge, fall, peak, cosine in zip(edges, falls, peaks.tolist(), cosines, strict=True):
@@ -207,11 +208,13 @@ class PaperSpeed:
         agreeing = bisect_right(ordered, high) - bisect_left(ordered, low)
         if agreeing < settings.fewest_rays:
             return _nothing(delay)
-        weights = falls if settings.average == "weighted" else [1.0] * count
-        total = sum(weights)
-        centre = middle if settings.average == "median" else sum(map(mul, weights, speeds)) / total
-        squares = [(speed - centre) ** 2 for speed in speeds]
-        spread = math.sqrt(sum(map(mul, weights, squares)) / total)
+        if settings.average == "weighted":
+            total = sum(falls)
+            centre = sum(map(mul, falls, speeds)) / total
+            spread = math.sqrt(sum(map(mul, falls, [(speed - centre) ** 2 for speed in speeds])) / total)
+        else:
+            centre = middle if settings.average == "median" else sum(speeds) / count
+            spread = math.sqrt(sum([(speed - centre) ** 2 for speed in speeds]) / count)
         return SpeedEstimate(speed=centre, quality=spread, rays=count, valid=True, delay=delay)
 
 

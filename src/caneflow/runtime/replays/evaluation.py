@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from caneflow.algorithms.cane_filter import CaneFilterSettings
 from caneflow.algorithms.error_summary import normalized_error_squared
 from caneflow.algorithms.rotations import Vector
 from caneflow.algorithms.track_errors import Floats, Track, TrackErrors, final_offset, track_errors
@@ -27,6 +28,7 @@ from caneflow.runtime.deployment import Replay, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.program import Sink
+from caneflow.runtime.replays.hindsight import HINDSIGHT_OF, SMOOTHED, smoother
 from caneflow.runtime.replays.workers import mapped, mapped_on_cluster
 from caneflow.runtime.wording import did_you_mean, listed, one_line
 
@@ -68,14 +70,18 @@ def offered_methods(graph: Graph) -> tuple[str, ...]:
 
 
 def chosen_methods(graph: Graph, wanted: Sequence[str] = ()) -> tuple[str, ...]:
-    """`wanted`, or all when there are none; raises DataflowError for a method that is not offered."""
-    offered = offered_methods(graph)
+    """`wanted`, or all that the estimator offers when there are none; raises DataflowError for one that is not there.
+
+    `smoothed` sees the whole recording at once: it is there to be asked for, and not one of all.
+    """
+    online = offered_methods(graph)
+    offered = (*online, SMOOTHED) if _hindsight(graph) is not None else online
     for method in wanted:
         if method not in offered:
             raise DataflowError(
                 f"no method {method!r};{did_you_mean(method, offered)} {ESTIMATOR} offers {listed(offered)}"
             )
-    return tuple(dict.fromkeys(wanted)) or offered
+    return tuple(dict.fromkeys(wanted)) or online
 
 
 def evaluated(
@@ -170,7 +176,7 @@ def _known_of(graph: Graph, path: Path) -> tuple[Track | None, Vector]:
 def _run(graph: Graph, recording: Path, methods: Sequence[str]) -> Mapping[str, list[Pose]]:
     """The poses that each method gives, by method."""
     poses: dict[str, list[Pose]] = {method: [] for method in methods}
-    side_by_side = _with_methods(graph, methods, _collector(poses))
+    side_by_side = _with_methods(graph, methods, poses)
     programs = {name: node.program for name, node in side_by_side.nodes.items() if node.program is not None}
     deployment = deploy(side_by_side, replay=Replay(recording=recording, speed=math.inf))
     outcome = InProcess(deployment, programs).run()
@@ -181,26 +187,33 @@ def _run(graph: Graph, recording: Path, methods: Sequence[str]) -> Mapping[str, 
     return poses
 
 
-def _with_methods(graph: Graph, methods: Sequence[str], collector: type[Sink]) -> Graph:
-    """The graph up to its estimator, which stands there once for each method, and the collector behind them."""
-    estimator = _estimator(graph)
+def _with_methods(graph: Graph, methods: Sequence[str], poses: dict[str, list[Pose]]) -> Graph:
+    """The graph up to its estimator, which stands there once for each method, and what fills `poses` behind them."""
+    estimator, collector = _estimator(graph), _collector(poses)
     nodes = {name: graph.nodes[name] for name in _upstream(graph, estimator)}
     queue = Queue(mode="all", length=1)  # in a replay everything is kept, whatever the length
     wires: dict[str, Wire] = {}
     for method in methods:
         name = f"{ESTIMATOR}.{method}"
+        if method == SMOOTHED and (hindsight := _hindsight(graph)) is not None:
+            program = smoother(hindsight, poses[method])
+            nodes[name] = replace(
+                estimator, name=name, program=program, outputs={}, settings=program.Settings(), settings_map={}
+            )
+            continue
         settings = {**estimator.settings_map, METHOD: method}
         nodes[name] = replace(estimator, name=name, settings_map=settings)
         wires[method] = Wire(node=name, port=POSE, kind=Pose, queue=queue, max_lag_ms=None, max_age_ms=None)
-    nodes[COLLECTOR] = replace(
-        estimator,
-        name=COLLECTOR,
-        program=collector,
-        inputs=wires,
-        outputs={},
-        settings=collector.Settings(),
-        settings_map={},
-    )
+    if wires:
+        nodes[COLLECTOR] = replace(
+            estimator,
+            name=COLLECTOR,
+            program=collector,
+            inputs=wires,
+            outputs={},
+            settings=collector.Settings(),
+            settings_map={},
+        )
     return replace(graph, nodes=nodes)
 
 
@@ -238,6 +251,12 @@ def _collector(poses: dict[str, list[Pose]]) -> type[Sink]:
             """Nothing to do."""
 
     return Collector
+
+
+def _hindsight(graph: Graph) -> CaneFilterSettings | None:
+    """What `smoothed` may be told: the settings of the method that it is the hindsight of, where there is that."""
+    settings = getattr(_estimator(graph).settings, HINDSIGHT_OF, None)
+    return settings if isinstance(settings, CaneFilterSettings) else None
 
 
 def _estimator(graph: Graph) -> Node:
