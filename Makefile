@@ -1,10 +1,11 @@
-# One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make docs`, `make soak`, `make bench`.
+# One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make docs`, `make soak`, `make bench`,
+# `make mcu-test`, `make clean`.
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 WALK := build/walk.mcap
 
-.PHONY: run test lint docs soak bench clean
+.PHONY: run test lint docs soak bench mcu-test clean
 
 # The environment is made once, and again when the project's needs change.
 $(BIN)/.installed: pyproject.toml
@@ -39,6 +40,11 @@ docs: $(BIN)/.installed
 # The long tests: every shared walk at real time and at full speed, calm and under load.
 soak: $(BIN)/.installed
 	$(BIN)/pytest -m long
+
+# The firmware: built, measured, booted in an emulator and compared with the model; docs/mcu.md says what that needs.
+mcu-test: $(BIN)/.installed
+	$(MAKE) -C mcu size CANEFLOW=$(abspath $(BIN))/caneflow
+	$(BIN)/pytest tests/test_luenberger_fixed.py tests/test_uart_frames.py tests/test_uart_gateway.py tests/test_mcu.py
 
 # On a machine that does nothing else: what a sample costs part by part, then a hop beside raw Zenoh and dora.
 bench: $(BIN)/.installed

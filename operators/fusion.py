@@ -12,6 +12,7 @@ from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
 from caneflow.algorithms.dead_reckoning import DeadReckoning
 from caneflow.algorithms.kalman import KalmanFilter, KalmanSettings
 from caneflow.algorithms.luenberger import LuenbergerObserver, LuenbergerSettings
+from caneflow.algorithms.luenberger_fixed import FixedLuenbergerObserver, observer_constants
 from caneflow.algorithms.naive_ins import NaiveIns, NaiveInsSettings
 from caneflow.algorithms.step_heading import StepHeading, StepHeadingSettings
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample
@@ -19,7 +20,7 @@ from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 
-Method: TypeAlias = Literal["luenberger", "kalman", "shs", "naive_ins", "best"]
+Method: TypeAlias = Literal["luenberger", "luenberger_fixed", "kalman", "shs", "naive_ins", "best"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +28,15 @@ class FusionSettings:
     """Which estimator, and what each may be told."""
 
     method: Method = "luenberger"
-    luenberger: LuenbergerSettings = field(default_factory=LuenbergerSettings)
+    luenberger: LuenbergerSettings = field(default_factory=LuenbergerSettings)  # also in fixed point
     kalman: KalmanSettings = field(default_factory=KalmanSettings)
     shs: StepHeadingSettings = field(default_factory=StepHeadingSettings)
     naive_ins: NaiveInsSettings = field(default_factory=NaiveInsSettings)
     best: CaneFilterSettings = field(default_factory=CaneFilterSettings)
+
+    def __post_init__(self) -> None:
+        if self.method == "luenberger_fixed":  # raises for what fixed point does not have
+            observer_constants(self.luenberger, (0.0, 1.0, 0.0))
 
 
 class Fusion(Operator):
@@ -82,6 +87,8 @@ def estimator(settings: FusionSettings, rig: Rig) -> DeadReckoning:
     match settings.method:
         case "luenberger":
             return LuenbergerObserver(settings.luenberger, boresight=rig.boresight)
+        case "luenberger_fixed":
+            return FixedLuenbergerObserver(settings.luenberger, boresight=rig.boresight)
         case "kalman":
             return KalmanFilter(settings.kalman, boresight=rig.boresight)
         case "shs":

@@ -1,0 +1,178 @@
+/* Arm's MPS2 with the AN386 image, a Cortex-M4 at 25 MHz, as qemu-system-arm emulates it: UART0, timer 0. */
+#include <stdbool.h>
+#include <stddef.h>
+
+#include "board.h"
+
+#define CLOCK UINT32_C(25000000) /* Hz */
+#define BAUD_RATE UINT32_C(921600)
+
+/* CMSDK APB UART, Arm DDI 0479, chapter 4. */
+struct uart {
+    volatile uint32_t data, state, control, interrupt, divider;
+};
+#define UART0 ((struct uart *)0x40004000)
+#define TX_FULL 1U
+#define RX_OVERRUN 8U
+#define TX_ENABLED 1U
+#define RX_ENABLED 2U
+#define RX_INTERRUPTS 8U
+#define RX_INTERRUPT 2U
+
+/* CMSDK APB timer: counts down from reload. */
+struct timer {
+    volatile uint32_t control, value, reload, interrupt;
+};
+#define TIMER0 ((struct timer *)0x40000000)
+
+#define INTERRUPTS_ENABLED ((volatile uint32_t *)0xe000e100)
+#define UART0_RX 0 /* number of its interrupt */
+
+#define QUEUE 512 /* bytes, a power of two: 5.5 ms at the baud rate */
+
+static uint8_t queue[QUEUE];
+static volatile uint32_t queue_in, queue_out; /* counted up without end */
+static volatile bool attention;               /* since the program slept there is something to do */
+static volatile uint32_t lost;
+static uint32_t asleep; /* ticks */
+
+void on_uart_received(void);
+void on_reset(void);
+int main(void);
+
+void on_uart_received(void)
+{
+    UART0->interrupt = RX_INTERRUPT; /* cleared first: a byte that comes from here on raises it again */
+    uint8_t byte = (uint8_t)UART0->data;
+    uint32_t in = queue_in, waiting = in - queue_out;
+    if (waiting < QUEUE) {
+        queue[in % QUEUE] = byte;
+        queue_in = in + 1;
+    } else {
+        lost++;
+    }
+    if (byte == 0 || waiting >= QUEUE / 2) /* the end of a frame is worth waking up for, single bytes are not */
+        attention = true;
+}
+
+void board_start(void)
+{
+    TIMER0->reload = UINT32_MAX;
+    TIMER0->value = UINT32_MAX;
+    TIMER0->control = 1;
+    UART0->divider = (CLOCK + BAUD_RATE / 2) / BAUD_RATE;
+    UART0->control = TX_ENABLED | RX_ENABLED | RX_INTERRUPTS;
+    *INTERRUPTS_ENABLED = 1U << UART0_RX;
+}
+
+size_t board_read(const uint8_t **data)
+{
+    uint32_t out = queue_out, size = queue_in - out, until_wrap = QUEUE - out % QUEUE;
+    *data = queue + out % QUEUE;
+    return size < until_wrap ? size : until_wrap;
+}
+
+void board_taken(size_t size)
+{
+    queue_out += size;
+}
+
+void board_write(const uint8_t *data, size_t size)
+{
+    for (const uint8_t *end = data + size; data < end; data++) {
+        while (UART0->state & TX_FULL) {
+        }
+        UART0->data = *data;
+    }
+}
+
+void board_wait(void)
+{
+    /* With interrupts masked nothing can come between the look at the flag and the sleep; one ends it all the same. */
+    uint32_t slept = 0;
+    while (!attention) {
+        __asm__ volatile("cpsid i" ::: "memory");
+        if (!attention) {
+            uint32_t began = board_ticks();
+            __asm__ volatile("dsb\n\twfi" ::: "memory");
+            slept += board_ticks() - began;
+        }
+        __asm__ volatile("cpsie i\n\tisb" ::: "memory");
+    }
+    attention = false;
+    asleep += slept;
+}
+
+uint32_t board_ticks(void)
+{
+    return ~TIMER0->value;
+}
+
+uint32_t board_ticks_per_second(void)
+{
+    return CLOCK;
+}
+
+uint32_t board_busy_ticks(void)
+{
+    return board_ticks() - asleep;
+}
+
+uint32_t board_lost_bytes(void)
+{
+    if (UART0->state & RX_OVERRUN) { /* at least one came before the interrupt had taken the one before it */
+        UART0->state = RX_OVERRUN;
+        lost++;
+    }
+    return lost;
+}
+
+/* --- what a C program needs before main, and what the compiler calls by itself --------------------------------- */
+
+extern uint32_t data_begin[], data_end[], data_stored[], bss_begin[], bss_end[], stack_top[];
+
+void on_reset(void)
+{
+    const uint32_t *from = data_stored;
+    for (uint32_t *to = data_begin; to < data_end; to++)
+        *to = *from++;
+    for (uint32_t *to = bss_begin; to < bss_end; to++)
+        *to = 0;
+    main();
+}
+
+static void on_fault(void)
+{
+    *(volatile uint32_t *)0xe000ed0c = 0x05fa0004; /* reset: the host notices that the session is gone */
+    for (;;) {
+    }
+}
+
+typedef void (*vector)(void);
+
+__attribute__((section(".vectors"), used)) static const struct {
+    uint32_t *stack;
+    vector handlers[16]; /* of exceptions 1 to 15 and of interrupt 0 */
+} vectors = {
+    stack_top,
+    {
+        on_reset, on_fault, on_fault, on_fault, on_fault, on_fault, NULL, NULL,
+        NULL, NULL, on_fault, on_fault, NULL, on_fault, on_fault, on_uart_received,
+    },
+};
+
+void *memcpy(void *restrict to, const void *restrict from, size_t size)
+{
+    uint8_t *at = to;
+    for (const uint8_t *byte = from; size > 0; size--)
+        *at++ = *byte++;
+    return to;
+}
+
+void *memset(void *to, int byte, size_t size)
+{
+    uint8_t *at = to;
+    for (; size > 0; size--)
+        *at++ = (uint8_t)byte;
+    return to;
+}

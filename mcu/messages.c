@@ -1,0 +1,132 @@
+/* Imu, GroundSpeed and Pose of the wire, version 1; see messages.h.
+ *
+ * What is read is checked: types, lengths, finite numbers, nothing behind the end. What is not read is skipped. */
+#include "messages.h"
+
+#include "msgpack.h"
+
+#define LARGEST_STAMP INT64_MAX
+
+static ieee754 read_finite(struct reader *reader)
+{
+    ieee754 value = read_number(reader);
+    if (!is_finite(value))
+        reader->failed = true;
+    return value;
+}
+
+/* Fixed number of finite numbers, or nil; whether there were any. */
+static bool read_vector(struct reader *reader, ieee754 *values, unsigned count)
+{
+    if (read_nil(reader))
+        return false;
+    if (read_array(reader) != count)
+        reader->failed = true;
+    for (unsigned i = 0; i < count && !reader->failed; i++)
+        values[i] = read_finite(reader);
+    return !reader->failed;
+}
+
+static int64_t read_stamp(struct reader *reader)
+{
+    uint64_t stamp = read_unsigned(reader);
+    if (stamp > (uint64_t)LARGEST_STAMP)
+        reader->failed = true;
+    return (int64_t)stamp;
+}
+
+static bool is_whole(const struct reader *reader, bool has_all)
+{
+    return has_all && !reader->failed && reader->at == reader->end;
+}
+
+bool read_imu(const uint8_t *data, size_t size, struct imu *imu)
+{
+    struct reader reader = {data, data + size, false};
+    bool has_stamp = false, has_seq = false, has_gyro = false;
+    ieee754 gyro[3];
+    imu->has_orientation = imu->has_accel = imu->has_linear_accel = false;
+    for (uint32_t pairs = read_map(&reader); pairs > 0 && !reader.failed; pairs--) {
+        struct text key = read_text(&reader);
+        if (reader.failed)
+            break;
+        if (is_text(key, "stamp")) {
+            imu->stamp = read_stamp(&reader);
+            has_stamp = true;
+        } else if (is_text(key, "seq")) {
+            read_unsigned(&reader);
+            has_seq = true;
+        } else if (is_text(key, "gyro")) {
+            has_gyro = read_vector(&reader, gyro, 3);
+        } else if (is_text(key, "accel")) {
+            imu->has_accel = read_vector(&reader, imu->accel, 3);
+        } else if (is_text(key, "linear_accel")) {
+            imu->has_linear_accel = read_vector(&reader, imu->linear_accel, 3);
+        } else if (is_text(key, "orientation")) {
+            imu->has_orientation = read_vector(&reader, imu->orientation, 4);
+        } else {
+            skip_value(&reader);
+        }
+    }
+    return is_whole(&reader, has_stamp && has_seq && has_gyro);
+}
+
+bool read_ground_speed(const uint8_t *data, size_t size, struct ground_speed *ground)
+{
+    struct reader reader = {data, data + size, false};
+    bool has_stamp = false, has_seq = false, has_speed = false, has_quality = false, has_rays = false,
+         has_valid = false;
+    ground->delay = 0;
+    for (uint32_t pairs = read_map(&reader); pairs > 0 && !reader.failed; pairs--) {
+        struct text key = read_text(&reader);
+        if (reader.failed)
+            break;
+        if (is_text(key, "stamp")) {
+            ground->stamp = read_stamp(&reader);
+            has_stamp = true;
+        } else if (is_text(key, "seq")) {
+            read_unsigned(&reader);
+            has_seq = true;
+        } else if (is_text(key, "speed")) {
+            ground->speed = read_finite(&reader);
+            has_speed = true;
+        } else if (is_text(key, "quality")) {
+            ieee754 quality = read_number(&reader); /* 0 or more, infinite when there is none */
+            if (is_not_a_number(quality) || quality > UINT64_C(1) << 63)
+                reader.failed = true;
+            has_quality = true;
+        } else if (is_text(key, "rays")) {
+            read_unsigned(&reader);
+            has_rays = true;
+        } else if (is_text(key, "valid")) {
+            ground->valid = read_bool(&reader);
+            has_valid = true;
+        } else if (is_text(key, "delay")) {
+            if (!read_nil(&reader))
+                ground->delay = read_finite(&reader);
+        } else {
+            skip_value(&reader);
+        }
+    }
+    return is_whole(&reader, has_stamp && has_seq && has_speed && has_quality && has_rays && has_valid);
+}
+
+static uint8_t *write_vector(uint8_t *at, const char *key, const ieee754 *values, unsigned count)
+{
+    at = write_array(write_text(at, key), count);
+    for (unsigned i = 0; i < count; i++)
+        at = write_double(at, values[i]);
+    return at;
+}
+
+size_t write_pose(const struct pose *pose, uint8_t *data)
+{
+    uint8_t *at = write_map(data, 6);
+    at = write_unsigned(write_text(at, "stamp"), (uint64_t)pose->stamp);
+    at = write_unsigned(write_text(at, "seq"), pose->seq);
+    at = write_vector(at, "position", pose->position, 3);
+    at = write_vector(at, "velocity", pose->velocity, 3);
+    at = write_vector(at, "orientation", pose->orientation, 4);
+    at = write_text(write_text(at, "method"), "luenberger_fixed");
+    return (size_t)(at - data);
+}
