@@ -22,6 +22,7 @@ from caneflow.runtime.program import ANY_PORT, Operator, Program, Sink, Source
 from caneflow.runtime.wording import did_you_mean, dotted, listed, one_line, shown
 
 ROOMS = ("drivers", "operators")
+TOOLS = ("tools.view",)  # that are programs of a graph as well
 IN_A_ROOM = re.compile(rf"({'|'.join(ROOMS)})\.[A-Za-z_][A-Za-z0-9_]*")
 FILES_NAMED = 8  # of a folder without the file that was asked for
 
@@ -37,7 +38,7 @@ def locate(run: str, base: Path) -> Located:
     """Where the program `run` is, a path being taken from the folder `base`; raises DataflowError if nowhere."""
     if "/" in run or run.endswith(".py"):
         return Located(file=_file(run, base))
-    if IN_A_ROOM.fullmatch(run) and importlib.util.find_spec(f"caneflow.{run}") is not None:
+    if (IN_A_ROOM.fullmatch(run) or run in TOOLS) and importlib.util.find_spec(f"caneflow.{run}") is not None:
         return Located(module=f"caneflow.{run}")
     there = available()
     hint = did_you_mean(run, there, likeness=0.75)  # all of them begin alike
@@ -49,7 +50,8 @@ def locate(run: str, base: Path) -> Located:
 
 def available() -> list[str]:
     """What `run` may name without a path."""
-    return [f"{room}.{module.name}" for room in ROOMS for module in pkgutil.iter_modules(_room(room).__path__)]
+    of_rooms = [f"{room}.{module.name}" for room in ROOMS for module in pkgutil.iter_modules(_room(room).__path__)]
+    return [*of_rooms, *TOOLS]
 
 
 def load_program(run: str, base: Path) -> Program:

@@ -1,0 +1,261 @@
+"""Serves the page on loopback: whole from this package, and to nobody who does not have its key.
+
+A page in a browser can be reached by other pages. So the websocket wants the key that is in the printed address,
+a Host that is this machine (against DNS rebinding), and an Origin that is this very page.
+"""
+
+import asyncio
+import secrets
+import socket
+import threading
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from importlib.resources import files
+from typing import Any, Protocol
+from urllib.parse import urlsplit
+
+import msgspec
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from caneflow.errors import CaneflowError
+from caneflow.viewing.packets import packet
+
+BEAT = 0.05  # s between two batches
+MOST_WAITING = 20  # batches for one page: 1 s; beyond, the oldest are left out and counted
+MOST_ASKED = 4_096  # bytes of a page's request
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+FORBIDDEN = 4403  # close code of a websocket without the key
+STOP_PATIENCE = 2.0  # s
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+
+
+class Feed(Protocol):
+    """What is shown: called on the server's thread, and must not block; only `answer` may take its time."""
+
+    lossless: bool  # whether a slow page is given everything all the same
+
+    def hello(self) -> bytes:
+        """What a page is told first."""
+        ...
+
+    def so_far(self) -> list[bytes]:
+        """What a page is told then: all that was given to others before it."""
+        ...
+
+    def batch(self, *, watched: bool) -> bytes | None:
+        """What is new since the last one; `watched`: somebody looks."""
+        ...
+
+    def answer(self, request: dict[str, Any]) -> bytes | None:
+        """What a page that asks is answered."""
+        ...
+
+
+class _Client:
+    """One open page: what waits to be sent to it."""
+
+    def __init__(self, *, lossless: bool) -> None:
+        self._waiting: deque[bytes] = deque()
+        self._most = None if lossless else MOST_WAITING
+        self._skipped = 0
+        self._told = 0
+        self._came = asyncio.Event()
+
+    def begin(self, first: list[bytes]) -> None:
+        """Send these, whatever their number, and forget what waits."""
+        self._waiting = deque(first)
+        self._came.set()
+
+    def offer(self, batch: bytes) -> None:
+        """Let `batch` wait; drop the oldest one when there are too many."""
+        if self._most is not None and len(self._waiting) >= self._most:
+            self._waiting.popleft()
+            self._skipped += 1
+        self._waiting.append(batch)
+        self._came.set()
+
+    async def next(self) -> bytes:
+        """What to send next, as soon as there is anything."""
+        while not self._waiting:
+            self._came.clear()
+            await self._came.wait()
+        if self._told != self._skipped:
+            self._told = self._skipped
+            return packet("skipped", batches=self._skipped)
+        return self._waiting.popleft()
+
+
+class PageServer:
+    """The page's server, on a thread of its own; a context manager."""
+
+    def __init__(self, feed: Feed, *, port: int = 0) -> None:
+        """`port` on 127.0.0.1, 0 for any that is free; raises CaneflowError when it is taken."""
+        self._feed = feed
+        self._clients: set[_Client] = set()
+        self._key = secrets.token_urlsafe(18)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._socket = _listen(port)
+        self.port: int = self._socket.getsockname()[1]
+        self.address = f"http://127.0.0.1:{self.port}/#{self._key}"
+        config = uvicorn.Config(
+            _OnlyHere(self._application()), log_level="warning", ws="wsproto", ws_max_size=MOST_ASKED, access_log=False,
+            timeout_graceful_shutdown=1, lifespan="on",
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page", daemon=True
+        )
+
+    def __enter__(self) -> "PageServer":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join(STOP_PATIENCE)
+        self._socket.close()
+
+    def show(self, feed: Feed) -> None:
+        """Show another feed from now on, on the pages that are open as well; from any thread."""
+
+        def change() -> None:
+            self._feed = feed
+            for client in self._clients:
+                client.begin([feed.hello(), *feed.so_far()])
+
+        if self._loop is None:
+            self._feed = feed
+        else:
+            self._loop.call_soon_threadsafe(change)
+
+    def _application(self) -> Starlette:
+        pages = [Route("/", self._file), Route("/{name}", self._file)]
+        return Starlette(routes=[*pages, WebSocketRoute("/samples", self._samples)], lifespan=self._lifespan)
+
+    @asynccontextmanager
+    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        self._loop = asyncio.get_running_loop()
+        beat = asyncio.create_task(self._beat())
+        try:
+            yield
+        finally:
+            beat.cancel()
+            with suppress(asyncio.CancelledError):
+                await beat
+
+    async def _beat(self) -> None:
+        """Offer each page what is new, 20 times a second."""
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        while True:
+            due = max(due + BEAT, loop.time())  # after a pause there is nothing to catch up with
+            await asyncio.sleep(due - loop.time())
+            batch = self._feed.batch(watched=bool(self._clients))
+            if batch is not None:
+                for client in self._clients:
+                    client.offer(batch)
+
+    async def _file(self, request: Request) -> Response:
+        name = request.path_params.get("name", "index.html")
+        file = files("caneflow.viewing").joinpath("page", name)
+        kind = TYPES.get(name.rpartition(".")[2])
+        if kind is None or not file.is_file():
+            return PlainTextResponse("not here\n", status_code=404)
+        return Response(file.read_bytes(), media_type=kind)
+
+    async def _samples(self, websocket: WebSocket) -> None:
+        if not self._is_of_this_page(websocket):
+            await websocket.close(FORBIDDEN)
+            return
+        await websocket.accept()
+        client = _Client(lossless=self._feed.lossless)
+        client.begin([self._feed.hello(), *self._feed.so_far()])
+        self._clients.add(client)  # at once: what comes from now on waits behind what was before
+        sending = asyncio.create_task(_send(websocket, client))
+        try:
+            await self._answer(websocket, client)
+        finally:
+            self._clients.discard(client)
+            sending.cancel()
+            with suppress(asyncio.CancelledError):
+                await sending
+
+    def _is_of_this_page(self, websocket: WebSocket) -> bool:
+        key = websocket.query_params.get("key", "")
+        origin = urlsplit(websocket.headers.get("origin", ""))
+        return secrets.compare_digest(key.encode(), self._key.encode()) and origin.netloc == websocket.headers["host"]
+
+    async def _answer(self, websocket: WebSocket, client: _Client) -> None:
+        """Answer the page's requests until it is closed."""
+        with suppress(WebSocketDisconnect):
+            while True:
+                try:
+                    request = msgspec.json.decode(await websocket.receive_text(), type=dict[str, Any])
+                except (msgspec.DecodeError, KeyError):  # KeyError: not a text
+                    continue
+                answer = await asyncio.to_thread(self._feed.answer, request)
+                if answer is not None:
+                    client.offer(answer)
+
+
+async def _send(websocket: WebSocket, client: _Client) -> None:
+    with suppress(WebSocketDisconnect, RuntimeError):  # RuntimeError: closed in between
+        while True:
+            await websocket.send_bytes(await client.next())
+
+
+class _OnlyHere:
+    """Answers requests that name this machine as their host, and adds the headers that fence the page in."""
+
+    def __init__(self, application: ASGIApp) -> None:
+        self._application = application
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._application(scope, receive, send)
+            return
+        host = urlsplit(f"//{Headers(scope=scope).get('host', '')}").hostname
+        if host not in LOOPBACK:
+            if scope["type"] == "http":
+                await PlainTextResponse("this page is for this machine only\n", status_code=403)(scope, receive, send)
+            else:
+                await WebSocket(scope, receive, send).close(FORBIDDEN)
+            return
+
+        async def fenced(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] += [(name.lower().encode(), text.encode()) for name, text in HEADERS.items()]
+            await send(message)
+
+        await self._application(scope, receive, fenced)
+
+
+def _listen(port: int) -> socket.socket:
+    listening = socket.socket()
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind(("127.0.0.1", port))
+        listening.listen()  # who comes before the server has started waits
+    except OSError as error:
+        listening.close()
+        raise CaneflowError(f"port {port} on 127.0.0.1: {error.strerror}; give another with --port, or 0") from error
+    return listening

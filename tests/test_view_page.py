@@ -1,0 +1,410 @@
+"""The live page in a real browser: what it shows is what is on the wire, and one needs neither mouse nor eyes."""
+
+import math
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, decode, numbered, sample_key
+from caneflow.messages.rig import Rig
+from caneflow.recording import RecordingWriter
+from caneflow.runtime.hosts.attach import ANY, Heard, attached
+from caneflow.viewing.columns import row_of
+from caneflow.viewing.live import LiveStreams
+
+pytest.importorskip("playwright", reason="playwright is not installed here (pip install 'caneflow[dev]')")
+server = pytest.importorskip("caneflow.viewing.server", reason="the extra `view` is not installed here")
+from playwright.sync_api import Browser, Page, sync_playwright  # noqa: E402
+
+CHROMIUM = shutil.which("chromium")
+CANEFLOW = [sys.executable, "-m", "caneflow.command"]
+DEADLINE = 30.0  # s for anything that is waited for
+BORESIGHT = (0.0, 1.0, 0.0)
+MINUS = "\N{MINUS SIGN}"
+AA = 4.5  # contrast of text
+
+WALKER = '''
+"""A pose, a speed, an IMU sample and a radar frame, 50 times a second."""
+import math
+import time
+import numpy as np
+from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame
+from caneflow.runtime import Source
+from caneflow.runtime.node import run
+
+class Walker(Source):
+    outputs = {"pose": Pose, "speed": GroundSpeed, "imu": Imu, "frame": RadarFrame}
+
+    def __init__(self, settings, context):
+        self._random = context.random
+
+    def samples(self):
+        at = 0
+        while True:
+            time.sleep(0.02)
+            at += 1
+            stamp = time.time_ns()
+            angle = 0.01 * at
+            yield "pose", Pose(
+                stamp=stamp, position=(3 * math.sin(angle), 3 - 3 * math.cos(angle), 0.0), velocity=(0.5, 0.1, 0.0),
+                orientation=(math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)), method="walker",
+                covariance=np.diag([1e-4 * at, 5e-5 * at, 1, 1, 1, 1]),
+            )
+            yield "speed", GroundSpeed(stamp=stamp, speed=0.5 + 0.1 * math.sin(at), quality=0.07, rays=12, valid=True)
+            yield "imu", Imu(stamp=stamp, gyro=tuple(self._random.normal(size=3).tolist()), accel=(0.0, 0.1, 9.81))
+            yield "frame", RadarFrame(
+                stamp=stamp, scans=self._random.integers(-999, 999, (1, 96), dtype=np.int32), scan_period=0.02,
+                range_start=0.5, range_step=0.009149, carrier=4.3e9, bandwidth=1.7e9,
+            )
+
+if __name__ == "__main__":
+    run(Walker)
+'''
+FLOW = """
+flow: {flow}
+nodes:
+  walker: {{run: ./walker.py}}
+  view: {{run: tools.view, inputs: {{pose: walker/pose, speed: walker/speed, imu: walker/imu, frame: walker/frame}}}}
+"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("chromium is not here (apt-get install chromium)")
+    with sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    opened = browser.new_page(viewport={"width": 1280, "height": 900})
+    opened.set_default_timeout(1e3 * DEADLINE)
+    problems: list[str] = []
+    opened.on("pageerror", lambda error: problems.append(str(error)))
+    opened.on("console", lambda line: problems.append(line.text) if line.type == "error" else None)
+    yield opened
+    opened.close()
+    assert [each for each in problems if "WebSocket" not in each] == []
+
+
+def until(condition: Callable[[], Any]) -> Any:
+    """What `condition` gives as soon as that is true."""
+    deadline = time.monotonic() + DEADLINE
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "waited for in vain"
+        time.sleep(0.02)
+    return found
+
+
+def pose(seq: int, sd: float = 0.1) -> Pose:
+    return Pose(
+        stamp=1_000_000_000 + 20_000_000 * seq,
+        seq=seq,
+        position=(0.01 * seq, -0.02 * seq, 0.0),
+        velocity=(0.5, 0.0, 0.0),
+        orientation=(1.0, 0.0, 0.0, 0.0),
+        method="kalman",
+        covariance=np.diag([sd**2, sd**2, 1.0, 1.0, 1.0, 1.0]),
+    )
+
+
+@pytest.fixture
+def shown(page: Page) -> Iterator[tuple[Page, LiveStreams]]:
+    """A page with 2 s of everything on it, of a flow that goes on when the test says so."""
+    streams = LiveStreams(flow="cane", rig=Rig())
+    with server.PageServer(streams) as serving:
+        for seq in range(100):
+            walk(streams, seq)
+        page.goto(serving.address)
+        until(lambda: page.evaluate("window.caneflow?.state.pictures.length > 0"))
+        until(lambda: page.inner_text("#at-seq") == "99")
+        yield page, streams
+
+
+def walk(streams: LiveStreams, seq: int, sd: float = 0.1) -> None:
+    stamp = 1_000_000_000 + 20_000_000 * seq
+    random = np.random.default_rng(seq)
+    frame = RadarFrame(
+        stamp=stamp, seq=seq, scans=random.integers(-999, 999, (1, 96), dtype=np.int32), scan_period=0.02,
+        range_start=0.5, range_step=0.009149, carrier=4.3e9, bandwidth=1.7e9,
+    )  # fmt: skip
+    streams.take("fusion/pose", pose(seq, sd), stamp)
+    streams.take(
+        "ground_speed/speed", GroundSpeed(stamp=stamp, seq=seq, speed=0.4, quality=0.05, rays=9, valid=True), stamp
+    )
+    streams.take("imu/imu", Imu(stamp=stamp, seq=seq, gyro=(0.1, 0.2, 0.3), accel=(0.0, 0.5, 9.8)), stamp)
+    streams.take("radar/frame", frame, stamp)
+
+
+def held(page: Page, name: str) -> list[list[float]]:
+    """Time and numbers of each sample that the page holds of a stream."""
+    rows: list[list[float]] = page.evaluate(
+        """(name) => {
+          const series = window.caneflow.state.series.get(name);
+          return Array.from({ length: series.length }, (_, i) =>
+            [series.times[i], ...series.rows.slice(i * series.width, (i + 1) * series.width)]);
+        }""",
+        name,
+    )
+    return rows
+
+
+def count_since(page: Page, stamp: int) -> int:
+    """Poses on the page that were sent after `stamp` (ns)."""
+    origin = page.evaluate("window.caneflow.state.origin")
+    return sum((origin + row[0]) * 1e9 >= stamp for row in held(page, "walker/pose"))
+
+
+def has_come(page: Page, seq: int) -> bool:
+    return bool(page.evaluate("window.caneflow.state.series.get('fusion/pose').lastSeq") == seq)
+
+
+# --- what is shown is what was sent -------------------------------------------------------------------------------
+
+
+def test_the_page_of_a_running_flow_shows_what_is_on_the_wire(page: Page, tmp_path: Path) -> None:
+    name = "t" + re.sub(r"\W", "", tmp_path.name).lower()[-40:]
+    (tmp_path / "walker.py").write_text(WALKER)
+    (tmp_path / "flow.yaml").write_text(FLOW.format(flow=name))
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    flow = subprocess.Popen([*CANEFLOW, "run", str(tmp_path / "flow.yaml")], stderr=subprocess.PIPE, text=True)
+    try:
+        assert flow.stderr is not None
+        address = next(found.group() for line in flow.stderr if (found := re.search(r"http://\S+", line)))
+        sent: dict[str, dict[int, Sample]] = {"walker/pose": {}, "walker/speed": {}, "walker/imu": {}}
+        kinds: dict[str, type[Sample]] = {"walker/pose": Pose, "walker/speed": GroundSpeed, "walker/imu": Imu}
+
+        def hear(heard: Heard) -> None:
+            stream = heard.key.partition("/")[2]
+            if stream in kinds:
+                sample = decode(heard.payload, kinds[stream])
+                sent[stream][sample.stamp] = sample
+
+        with attached(name) as here, here.samples([(ANY, ANY)], hear):
+            page.goto(address)
+            begin = until(lambda: max(sent["walker/pose"], default=0))
+            until(lambda: page.inner_text("#edges").count("walker/pose → view.pose"))
+            until(lambda: count_since(page, begin) > 40)
+            page.keyboard.press("Space")
+            until(lambda: page.inner_text("#connection") == "❚❚ paused")
+            page.keyboard.press("ArrowLeft")
+            until(
+                lambda: (
+                    page.evaluate("window.caneflow.state.newestTime") > page.evaluate("window.caneflow.state.cursor")
+                )
+            )
+            rows = {stream: held(page, stream) for stream in sent}
+            origin = page.evaluate("window.caneflow.state.origin")
+            shown = page.inner_text("#at-x"), page.inner_text("#at-y"), page.evaluate("window.caneflow.state.cursor")
+            until(lambda: page.inner_text("#nodes").count("● ready") == 2)
+        for stream, samples in rows.items():
+            compared = 0
+            stamps = np.array(sorted(sent[stream]))
+            for time_s, *numbers in samples:
+                stamp = int(stamps[np.abs(stamps - (origin + time_s) * 1e9).argmin()])
+                if begin <= stamp and abs(stamp * 1e-9 - origin - time_s) < 1e-6:  # both were there already
+                    expected = row_of(sent[stream][stamp], BORESIGHT)
+                    assert numbers == pytest.approx(expected, rel=0, abs=0, nan_ok=True)
+                    compared += 1
+            assert compared > 30, stream
+        last = [row for row in rows["walker/pose"] if row[0] <= shown[2] + 1e-9][-1]
+        assert shown[:2] == tuple(f"{last[i]:.2f} m".replace("-", MINUS) for i in (1, 2))
+    finally:
+        flow.terminate()
+        flow.communicate(timeout=DEADLINE)
+    assert {re.match(r"http://127\.0\.0\.1:\d+/", url) is not None or url == "data:," for url in asked} == {True}
+
+
+def test_a_recording_is_scrubbed_to_the_very_sample(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "walk.mcap"
+    with RecordingWriter(path, flow="cane", source="simulated", rig={}) as writer:
+        for seq in range(500):
+            message = pose(seq)
+            key = sample_key("cane", "fusion", "pose")
+            writer.write(key, Pose, numbered(message, seq), stamp=message.stamp, seq=seq, log_time=message.stamp)
+    viewing = subprocess.Popen([*CANEFLOW, "view", str(path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert viewing.stdout is not None
+        page.goto(viewing.stdout.readline().split()[0])
+        until(lambda: page.evaluate("window.caneflow?.state.series.get('fusion/pose')?.length === 500"))
+        page.locator("#cursor").fill("4.36")
+        until(lambda: page.inner_text("#at-x") == "2.18 m")  # sample 218
+        assert page.inner_text("#at-y") == f"{MINUS}4.36 m"
+        assert page.inner_text("#time") == "4.36 of 9.98 s"
+        page.get_by_role("button", name="Play").click()
+        until(lambda: page.evaluate("window.caneflow.state.cursor") > 4.4)
+    finally:
+        viewing.terminate()
+        viewing.communicate(timeout=DEADLINE)
+
+
+def test_an_uncertain_position_is_said_to_be(shown: tuple[Page, LiveStreams]) -> None:
+    page, streams = shown
+    assert page.inner_text("#at-sure") == "±0.20 m"
+    assert not page.eval_on_selector("#at-sure", "place => place.classList.contains('unsure')")
+    walk(streams, 100, sd=3.0)
+    until(lambda: page.inner_text("#at-sure") == "±6.00 m")
+    assert page.eval_on_selector("#at-sure", "place => getComputedStyle(place).textDecorationStyle") == "dashed"
+    page.keyboard.press("w")
+    until(lambda: "This is uncertain, by 6.0 metres." in page.inner_text("#words"))
+
+
+def test_a_position_that_does_not_come_any_more_is_said_to_be_old(shown: tuple[Page, LiveStreams]) -> None:
+    page, _ = shown
+    until(lambda: page.evaluate("performance.now() - window.caneflow.state.cameAt") > 2000)
+    page.keyboard.press("w")
+    assert re.match(r"No new position for \d+ seconds\.", page.inner_text("#words"))
+
+
+def test_a_page_that_is_opened_without_the_key_says_so(page: Page) -> None:
+    with server.PageServer(LiveStreams(flow="cane", rig=Rig())) as serving:
+        page.goto(serving.address.partition("#")[0])
+        until(lambda: "lacks its key" in page.inner_text("[role=alert]"))
+
+
+# --- without a mouse, without eyes --------------------------------------------------------------------------------
+
+
+def test_everything_can_be_done_by_keys(shown: tuple[Page, LiveStreams]) -> None:
+    page, streams = shown
+    page.keyboard.press("Space")
+    assert page.inner_text("#pause") == "Go on"
+    at = page.evaluate("window.caneflow.state.cursor")
+    page.keyboard.press("Shift+ArrowLeft")
+    assert page.evaluate("window.caneflow.state.cursor") == pytest.approx(at - 1.0)
+    until(lambda: page.inner_text("#at-x") == f"{0.01 * 49:.2f} m")
+    walk(streams, 100)
+    until(lambda: page.evaluate("window.caneflow.state.newestTime") == pytest.approx(2.0))
+    assert page.inner_text("#at-x") == "0.49 m", "held"
+    page.keyboard.press("End")
+    until(lambda: page.inner_text("#at-x") == "1.00 m")
+    page.keyboard.press("f")
+    assert page.get_attribute("#follow", "aria-pressed") == "true"
+    page.keyboard.press("?")
+    assert page.get_by_role("dialog", name="Keys").is_visible()
+    page.keyboard.press("Escape")
+
+
+def test_the_focus_reaches_every_control_and_shows(shown: tuple[Page, LiveStreams]) -> None:
+    page, _ = shown
+    wanted = set(page.eval_on_selector_all(
+        "button, select, input, canvas[tabindex], .scroll",
+        "all => all.filter((each) => each.checkVisibility()).map((each) => each.id || each.className)",
+    ))  # fmt: skip
+    reached = set()
+    for _ in range(len(wanted) + 3):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.className"))
+        if page.evaluate("document.activeElement !== document.body"):  # else: round to the browser's own
+            assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    assert wanted <= reached
+
+
+def test_what_is_shown_has_roles_and_names(shown: tuple[Page, LiveStreams]) -> None:
+    page, _ = shown
+    roles: list[tuple[Any, str | None]] = [
+        ("main", None), ("heading", "caneflow cane"), ("heading", "Plan"), ("img", "Plan of the track"),
+        ("img", "Speed over ground m/s; band: quality"), ("img", "Range and Doppler white line: superior edge"),
+        ("img", "Turn rate rad/s, body"), ("slider", "Time cursor"), ("button", "Pause"), ("button", "Zoom in"),
+        ("combobox", "Say the position"), ("table", None), ("row", "fusion/pose → this page"),
+        ("columnheader", "Latency, median"), ("region", "Edges"),
+    ]  # fmt: skip
+    for role, name in roles:
+        found = page.get_by_role(role, name=name) if name else page.get_by_role(role)
+        assert found.first.is_visible(), (role, name)
+    unnamed = page.eval_on_selector_all(
+        "button, select, input, [role=img], [role=region]",
+        """all => all.filter((each) => !(each.ariaLabel || each.textContent.trim() || each.labels?.length
+          || each.getAttribute("aria-labelledby"))).map((each) => each.outerHTML)""",
+    )
+    assert unnamed == []
+    described = page.eval_on_selector_all("[aria-labelledby], [aria-describedby]", """all => all.flatMap((each) =>
+        [each.getAttribute("aria-labelledby"), each.getAttribute("aria-describedby")])
+        .filter((id) => id && !document.getElementById(id))""")  # fmt: skip
+    assert described == []
+    assert page.get_attribute("html", "lang") == "en"
+    assert page.get_attribute("#words", "aria-live") == "polite"
+
+
+def test_the_position_is_said_at_a_calm_rate(shown: tuple[Page, LiveStreams]) -> None:
+    page, streams = shown
+    page.evaluate("""() => {
+      window.said = 0;
+      const words = document.getElementById("words");
+      new MutationObserver(() => { window.said += 1; }).observe(words, { childList: true });
+    }""")
+    for seq in range(100, 160):
+        walk(streams, seq)
+        until(partial(has_come, page, seq))
+    assert page.evaluate("window.said") <= 1
+    page.select_option("#calm", "0")
+    walk(streams, 160)
+    until(lambda: page.get_attribute("#words", "aria-live") == "off")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_text_stands_out_from_what_lies_behind_it(shown: tuple[Page, LiveStreams], theme: str) -> None:
+    page, _ = shown
+    page.select_option("#theme", theme)
+    colours = page.evaluate(
+        """() => [...document.querySelectorAll("body *")].filter((each) => each.checkVisibility()
+          && [...each.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim())).map((each) => {
+          let behind = each;
+          const back = (place) => getComputedStyle(place).backgroundColor;
+          while (behind && back(behind) === "rgba(0, 0, 0, 0)") behind = behind.parentElement;
+          return [each.id || each.outerHTML.slice(0, 60), getComputedStyle(each).color,
+            back(behind ?? document.body)];
+        })"""
+    )
+    assert len(colours) > 30
+    names = ["ink", "muted", "blue", "orange", "green", "purple", "good", "wait", "bad"]
+    card, *drawn = page.evaluate(
+        """(names) => ["card", ...names].map((name) =>
+          getComputedStyle(document.documentElement).getPropertyValue(`--${name}`))""",
+        names,
+    )
+    colours += [(name, colour, card) for name, colour in zip(names, drawn, strict=True)]
+    for what, colour, behind in colours:
+        assert contrast(colour, behind) >= AA, (what, colour, behind)
+
+
+def contrast(one: str, other: str) -> float:
+    """As WCAG 2 defines it."""
+    light, dark = sorted((luminance(one), luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+def luminance(colour: str) -> float:
+    text = colour.strip()
+    parts = (
+        [int(text[i : i + 2], 16) for i in (1, 3, 5)] if text[0] == "#" else map(float, re.findall(r"[\d.]+", text)[:3])
+    )
+    linear = [c / 12.92 if (c := part / 255) <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(math.prod(pair) for pair in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def test_who_wants_no_motion_gets_two_pictures_a_second(shown: tuple[Page, LiveStreams]) -> None:
+    page, streams = shown
+    page.emulate_media(reduced_motion="reduce")
+    page.evaluate("window.caneflow.costs.length = 0")
+    begin = page.evaluate("performance.now()")
+    for seq in range(100, 150):
+        walk(streams, seq)
+        until(partial(has_come, page, seq))
+    drawn, took_s = page.evaluate(
+        "(begin) => [window.caneflow.costs.length, (performance.now() - begin) / 1000]", begin
+    )
+    assert drawn <= 2 * took_s + 1
