@@ -1,11 +1,13 @@
 """Where a person is in a room, from static Doppler modules and, if they wear one, an IMU.
 
 in   <sensor> : DopplerTarget   any number; the port's name is the sensor's in the rig
-in   imu      : Imu             its orientation tells which way the person faces; may be left out
+in   imu      : Imu             its orientation tells which way the person faces, its acceleration whether they walk;
+                                may be left out
+in   cane     : Pose            the person's own dead reckoning, whose drift the sensors bound; may be left out
 out  pose     : Pose            one per 50 ms, at the first sample of any input that is due
 
-`method` of a pose says more than the estimator's name: ` static_or_lost` when no sensor sees anything move, so that
-the position is held, and ` without west` when the sensor `west` has fallen silent.
+`method` of a pose says more than the estimator's name: ` static_or_lost` when no sensor sees anything move or the
+person is felt to stand, and ` without west` when the sensor `west` has fallen silent.
 """
 
 import math
@@ -14,13 +16,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
-from annotated_types import Gt
+from annotated_types import Ge, Gt
 
 from caneflow.algorithms.dead_reckoning import heading_of
 from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
 from caneflow.algorithms.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
 from caneflow.algorithms.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor
-from caneflow.algorithms.rotations import Quaternion, from_yaw
+from caneflow.algorithms.rotations import Quaternion, from_yaw, rotate
+from caneflow.algorithms.standing import StandingDetector, StandingSettings
 from caneflow.messages import DopplerTarget, Imu, MessageError, Pose, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import ANY_PORT, Context, Emitted, Operator, Refused
@@ -28,7 +31,7 @@ from caneflow.runtime.node import run
 
 Method: TypeAlias = Literal["particle", "heading_particle", "ekf", "best"]
 
-IMU = "imu"
+IMU, CANE = "imu", "cane"
 SLOWEST_TO_FACE = 0.2  # m/s; without an IMU a slower velocity does not tell which way the person faces
 FLOOR_VARIANCE = 1e-6  # m^2 and m^2/s^2, of the height: the person is on the floor
 
@@ -36,6 +39,11 @@ FLOOR_VARIANCE = 1e-6  # m^2 and m^2/s^2, of the height: the person is on the fl
 def plain() -> RoomEkfSettings:
     """The filter that takes the strength at its word: no state for what is slowly wrong with it."""
     return RoomEkfSettings(bias_error=0.0)
+
+
+def worn_on_a_belt() -> StandingSettings:
+    """A belt swings by 0.3 m/s^2 or more as soon as its wearer walks; who turns on the spot stands."""
+    return StandingSettings(window=0.5, largest_turn_rate=math.tau, largest_acceleration=0.2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +55,8 @@ class RoomTrackerSettings:
     method: Method = "best"
     period: Annotated[float, Gt(0)] = 0.05  # s between poses
     forward: tuple[float, float, float] = (1.0, 0.0, 0.0)  # the way the person faces, in the IMU's axes
+    standing: StandingSettings = field(default_factory=worn_on_a_belt)
+    cane_ahead: Annotated[float, Ge(0)] = 0.55  # m, of the cane's sensors in front of the person
     silent_after: Annotated[float, Gt(0)] = 0.5  # s without a sample, after which a sensor counts as silent
     particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
     heading_particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
@@ -57,20 +67,24 @@ class RoomTrackerSettings:
 class RoomTrackerOperator(Operator):
     """One tracker, told of every target and every heading, and asked once per period."""
 
-    inputs = {ANY_PORT: DopplerTarget, IMU: Imu}
+    inputs = {ANY_PORT: DopplerTarget, IMU: Imu, CANE: Pose}
     outputs = {"pose": Pose}
-    optional_inputs = frozenset({IMU})
+    optional_inputs = frozenset({IMU, CANE})
     Settings = RoomTrackerSettings
 
     def __init__(self, settings: RoomTrackerSettings, context: Context) -> None:
-        names = [port for port in context.ports if port != IMU]
+        names = [port for port in context.ports if port not in (IMU, CANE)]
         self._settings = settings
+        self._boresight = context.rig.boresight  # of the cane
         self._tracker = tracker(settings, context, names)
+        if CANE in context.ports and not isinstance(self._tracker, RoomEkf):
+            raise MessageError(f"room_tracker: {settings.method} cannot use the cane; ekf and best can")
         self._heard_ns: dict[str, int | None] = dict.fromkeys(names)
         self._begin_ns: int | None = None  # stamp of the first sample
         self._due_ns = 0
         self._facing: Quaternion | None = None  # by the IMU
         self._course = 0.0  # rad, by the velocity
+        self._steps = StandingDetector(settings.standing)
 
     def handle(self, port: str, message: Sample) -> Emitted:
         """Take the sample; yield a pose when one is due."""
@@ -80,6 +94,8 @@ class RoomTrackerOperator(Operator):
                 self._take_target(port, message)
             case Imu():
                 self._take_heading(message)
+            case Pose():
+                self._take_cane(message)
         if message.stamp >= self._due_ns:
             self._due_ns = message.stamp + round(self._settings.period * 1e9)
             yield "pose", self._pose(message.stamp)
@@ -97,7 +113,21 @@ class RoomTrackerOperator(Operator):
             raise Refused("the IMU sample has no orientation; put operators.attitude in front of room_tracker")
         self._facing = imu.orientation
         cosine, sine = heading_of(imu.orientation, self._settings.forward)
-        self._tracker.heading(imu.stamp, math.atan2(sine, cosine))
+        self._tracker.heading(imu.stamp, math.atan2(sine, cosine), self._stands(imu, imu.orientation))
+
+    def _take_cane(self, pose: Pose) -> None:
+        """The cane is ahead of the person, in the direction in which it points; a swing averages out."""
+        assert isinstance(self._tracker, RoomEkf)
+        self._hear(pose.stamp)
+        cosine, sine = heading_of(pose.orientation, self._boresight)
+        ahead = self._settings.cane_ahead
+        self._tracker.walked(pose.stamp, (pose.position[0] - ahead * cosine, pose.position[1] - ahead * sine))
+
+    def _stands(self, imu: Imu, orientation: Quaternion) -> bool | None:
+        """Whether the wearer stands; None without an accelerometer."""
+        if imu.linear_accel is None:
+            return None
+        return self._steps.update(imu.stamp, imu.gyro, rotate(orientation, imu.linear_accel))
 
     def _hear(self, stamp: int) -> None:
         if self._begin_ns is None:

@@ -128,7 +128,7 @@ def test_a_radar_whose_answers_do_not_come(look: Any, udp: socket.socket, monkey
     assert all(isinstance(request, mrm.GetStatusRequest) for request in asked)
 
 
-def test_without_devices_it_says_what_it_can(look: Any, tmp_path: Path) -> None:
+def test_options_of_the_devices_need_devices(look: Any, tmp_path: Path) -> None:
     app = typer.Typer()
     app.command()(doctor.command)
-    assert "say --devices" in str(CliRunner().invoke(app, []).exception)
+    assert "add --devices" in str(CliRunner().invoke(app, ["--set", "imu.rate=50"]).exception)

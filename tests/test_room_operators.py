@@ -63,8 +63,12 @@ def front_end(rig: Rig = RIG, **chosen: object) -> Doppler:
     return Doppler(DopplerSettings(**chosen), context)  # type: ignore[arg-type]  # each test names its own
 
 
-def tracker(*sensors: str, imu: bool = True, rig: Rig = RIG, **chosen: object) -> RoomTrackerOperator:
+def tracker(
+    *sensors: str, imu: bool = True, cane: bool = False, rig: Rig = RIG, **chosen: object
+) -> RoomTrackerOperator:
     ports: dict[str, type[Sample]] = dict.fromkeys(sensors, DopplerTarget)
+    if cane:
+        ports["cane"] = Pose
     if imu:
         ports["imu"] = Imu
     context = Context(node="room_tracker", rig=rig, ports=ports, random=np.random.default_rng(0))
@@ -174,6 +178,55 @@ def test_when_nobody_sees_anything_move_the_pose_says_so() -> None:
     assert poses[10].method == "best"
     assert poses[-1].method == "best static_or_lost"
     assert math.hypot(*poses[-1].velocity) < 0.05
+
+
+def test_a_belt_that_shakes_is_worn_by_somebody_who_walks() -> None:
+    def methods(shake: float) -> list[str]:
+        operator = tracker("south", "west")
+        told_all: list[tuple[str, Sample]] = []
+        for index in range(40):
+            for tick in range(5):
+                at = 5 * index + tick
+                force = shake * math.sin(2.0 * math.pi * 1.8 * 0.01 * at)
+                worn = Imu(
+                    stamp=START_NS + at * BLOCK_NS // 5,
+                    gyro=(0.0, 0.0, 0.0),
+                    orientation=from_yaw(0.3),
+                    linear_accel=(0.0, 0.0, force),
+                )
+                told_all.append(("imu", worn))
+            told_all += [(name, target(index, offset_ns=45_000_000)) for name in ("south", "west")]
+        return [pose.method for pose in told(operator, *told_all)]
+
+    assert methods(1.0)[-1] == "best"
+    assert methods(0.02)[-1] == "best static_or_lost"
+
+
+def test_the_cane_leads_the_person_who_is_behind_it() -> None:
+    """A cane that goes 2 m to the east takes the person 2 m to the east; one that turns about them leaves them."""
+    operator = tracker("south", "west", imu=False, cane=True)
+    poses = []
+    for index in range(100):
+        east = 0.02 * index
+        # its boresight is y_b: a yaw of -90 degrees lets it point along x0
+        pose = Pose(
+            stamp=START_NS + index * BLOCK_NS,
+            position=(10.0 + east, 5.0, 0.0),
+            velocity=(0.4, 0.0, 0.0),
+            orientation=from_yaw(-0.5 * math.pi),
+            method="best",
+        )
+        poses += told(operator, ("cane", pose), *[(name, target(index, valid=False)) for name in ("south", "west")])
+    first, last = poses[10], poses[-1]
+    walked = np.array(last.position) - np.array(first.position)
+    assert walked[:2] == pytest.approx([0.02 * 89, 0.0], abs=0.05)
+    assert last.velocity[0] == pytest.approx(0.4, abs=0.02)
+
+
+@pytest.mark.parametrize("method", ["particle", "heading_particle"])
+def test_a_method_that_cannot_use_the_cane_says_so(method: Method) -> None:
+    with pytest.raises(MessageError, match="cannot use the cane"):
+        tracker("south", cane=True, method=method)
 
 
 def test_an_imu_without_orientation_is_refused() -> None:
@@ -296,7 +349,7 @@ def test_calibrate_says_what_it_lacks(tmp_path: Path, caneflow: Callable[..., Ru
     assert "X,Y" in error
 
 
-@pytest.mark.parametrize("flow", ["room.yaml", "room4.yaml"])
+@pytest.mark.parametrize("flow", ["room.yaml", "room4.yaml", "cane_in_room.yaml"])
 def test_the_flows_are_sound(flow: str, caneflow: Callable[..., Run]) -> None:
     status, said, error = caneflow("check", ROOT / "dataflows" / flow)
     assert (status, error) == (0, "")

@@ -21,11 +21,13 @@ from caneflow.algorithms.room_particles import (
 from caneflow.algorithms.room_tracking import (
     Echo,
     HeadingHistory,
+    MotionWatch,
     RoomEstimate,
     RoomStart,
     RoomTracker,
     SilenceWatch,
     StaticSensor,
+    WayHistory,
     pattern_loss,
 )
 
@@ -222,6 +224,86 @@ def test_step_of_a_thousand_particles(benchmark: Any) -> None:
 
     last = benchmark.pedantic(step, setup=lambda: (next(coming), {}), rounds=len(told))
     assert math.dist(last.position, circle(299 * 0.05)[:2]) < 2.0
+
+
+@pytest.mark.parametrize("name", ["ekf", "heading_particle"])
+def test_who_is_felt_to_stand_is_held_at_once_whatever_the_sensors_say(name: str) -> None:
+    make, _ = METHODS[name]
+    tracker = make(GUESS)
+    walk(tracker, 10.0)
+    before = tracker.estimate(START_NS + 199 * HOP_NS).position
+    for hop in range(200, 260):
+        stamp = START_NS + hop * HOP_NS
+        tracker.heading(stamp, 1.0, True)
+        for sensor in SENSORS:  # an arm that moves
+            tracker.echo(sensor, Echo(stamp_ns=stamp, valid=True, range_rate=0.8, signed=False, strength=-30.0))
+    estimate = tracker.estimate(stamp)
+    assert not tracker.moving
+    assert math.dist(estimate.position, before) < 0.5
+    assert math.hypot(*estimate.velocity) < 0.1
+    tracker.heading(stamp + HOP_NS, 1.0, False)
+    tracker.echo("south", Echo(stamp_ns=stamp + HOP_NS, valid=True, range_rate=0.8, signed=False, strength=-30.0))
+    assert tracker.moving
+
+
+def test_who_walks_again_walks_ahead() -> None:
+    tracker = RoomEkf(RoomEkfSettings(use_speed=False, use_strength=False), SENSORS, GUESS)
+    for hop in range(31):
+        stamp = START_NS + hop * HOP_NS
+        tracker.heading(stamp, 2.0, hop < 30)
+        tracker.echo("south", Echo(stamp_ns=stamp, valid=True))
+        if hop == 29:
+            assert math.hypot(*tracker.estimate(stamp).velocity) < 0.01
+    assert tracker.estimate(stamp).velocity == pytest.approx((0.5 * math.cos(2.0), 0.5 * math.sin(2.0)), abs=0.05)
+
+
+def test_an_imu_that_falls_silent_no_longer_says_that_its_wearer_stands() -> None:
+    watch = MotionWatch(0.7, 0.5)
+    watch.steps(START_NS, True)
+    watch.echo(START_NS, True)
+    assert watch.standing(START_NS + 400_000_000)
+    assert not watch.moving(START_NS + 400_000_000)
+    assert watch.moving(START_NS + 600_000_000)
+    watch.steps(START_NS + 700_000_000, None)  # it cannot tell
+    assert watch.moving(START_NS + 700_000_000)
+
+
+def test_the_drift_of_dead_reckoning_is_bounded_by_the_sensors() -> None:
+    """A way that turns by 0.7 degrees too much per second and is 3 % too long: alone it is lost in a minute."""
+
+    def errors(with_way: bool) -> tuple[np.ndarray, np.ndarray]:
+        tracker, random = RoomEkf(RoomEkfSettings(), SENSORS, GUESS), np.random.default_rng(7)
+        place, found, alone = np.array(circle(0.0)[:2]), [], []
+        for hop in range(1600):
+            at, stamp = hop * 0.05, START_NS + hop * HOP_NS
+            x, y, heading = circle(at)
+            wrong = heading + math.radians(0.7) * at
+            place = place + 0.0515 * np.array([math.cos(wrong), math.sin(wrong)])
+            if with_way:
+                tracker.walked(stamp, (float(place[0]), float(place[1])))
+            for name, sensor in SENSORS.items():
+                tracker.echo(name, echo_at(sensor, at, stamp, random, False))
+            found.append(math.dist(tracker.estimate(stamp).position, (x, y)))
+            alone.append(math.dist(place, (x, y)))
+        return np.array(found)[100:], np.array(alone)[100:]
+
+    both, cane = errors(True)
+    sensors, _ = errors(False)
+    assert cane.max() > 2.0
+    assert both.mean() < sensors.mean()
+    assert both[-400:].mean() < 0.5 * cane[-400:].mean()  # the one is bounded, the other grows on
+
+
+def test_a_way_is_interpolated_and_its_velocity_is_a_mean() -> None:
+    way = WayHistory()
+    assert math.isinf(way.age(START_NS))
+    for tick in range(101):
+        way.add(START_NS + tick * 10_000_000, (0.008 * tick, -0.002 * tick))
+    assert way.between(START_NS + 105_000_000, START_NS + 215_000_000) == pytest.approx((0.088, -0.022))
+    assert way.between(START_NS + 900_000_000, START_NS + 2_000_000_000) == pytest.approx((0.08, -0.02))
+    assert way.velocity(START_NS + 900_000_000, 500_000_000) == pytest.approx((0.8, -0.2))
+    with pytest.raises(ValueError, match="not after"):
+        way.add(START_NS, (0.0, 0.0))
 
 
 def test_headings_add_up_to_the_way_that_was_walked() -> None:

@@ -23,6 +23,7 @@ from caneflow.simulation.room_scenario import (
     RoomRecording,
     RoomSettings,
     room_settings,
+    simulate_kinds,
     simulate_room,
 )
 from caneflow.simulation.room_walk import PersonSettings
@@ -53,6 +54,12 @@ def test_seeds_reproduce_a_recording_bit_for_bit() -> None:
     assert not any(same(one, other_person).values())
     assert one.rig == other_person.rig
     assert one.rig != other_room.rig
+
+
+def test_both_kinds_of_module_hear_what_each_would_hear_alone() -> None:
+    both = simulate_kinds(BRIEF, "axial_x", 5, ("real", "iq"))
+    assert all(same(both["real"], simulate_room(BRIEF, "axial_x", 5)).values())
+    assert all(same(both["iq"], simulate_room(replace(BRIEF, modules="iq"), "axial_x", 5)).values())
 
 
 def test_parts_and_sensors_have_their_own_random_numbers() -> None:

@@ -127,3 +127,9 @@ def test_the_shell_completes_words_and_options(typed: str, offered: str) -> None
     start = [sys.executable, "-m", "caneflow.command"]
     done = subprocess.run(start, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
     assert done.stdout.split() == [offered]
+
+
+def test_status_imports_little_as_it_has_to_answer_at_once() -> None:
+    look = "import sys, caneflow.tools.status; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert not {"numpy", "pydantic", "scipy", "ruamel", "mcap", "rich.live"} & set(done.stdout.split())

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,11 +9,13 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from caneflow.algorithms.doppler_line import DopplerLineSettings, predominant_line
 from caneflow.algorithms.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
 from caneflow.algorithms.room_calibration import (
     CalibrationSettings,
+    Hops,
     RangeCalibration,
+    counting,
+    hops_over,
     integrated_ranges,
     range_calibration,
     sight,
@@ -32,17 +33,6 @@ Floats = NDArray[np.float64]
 
 class CalibrationError(CaneflowError):
     """Recordings that do not tell what is asked of them."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Hops:
-    """What one sensor's front end saw in one recording, by hop."""
-
-    stamps: NDArray[np.int64]  # shape (H,), ns, of what the value belongs to
-    range_rates: Floats  # shape (H,), m/s
-    amplitudes: Floats  # shape (H,), full scale = 1
-    valid: NDArray[np.bool_]  # shape (H,)
-    signed: bool
 
 
 def room(
@@ -129,15 +119,7 @@ def hops_of(recording: Path, sensor: str, floor: Floats) -> Hops:
         raise CalibrationError(f"{recording}: {sensor}/{BLOCK} has not a single window")
     if spectra[0][1].power.shape != floor.shape:
         raise CalibrationError(f"{recording}: {sensor} was sampled otherwise than in the empty room")
-    settings = DopplerLineSettings()
-    lines = [predominant_line(replace(spectrum, floor=floor), settings) for _, spectrum in spectra]
-    return Hops(
-        stamps=np.array([stamp for stamp, _ in spectra], dtype=np.int64),
-        range_rates=np.array([line.range_rate for line in lines]),
-        amplitudes=np.array([line.amplitude for line in lines]),
-        valid=np.array([line.valid for line in lines], dtype=np.bool_),
-        signed=spectra[0][1].signed,
-    )
+    return hops_over(spectra, floor)
 
 
 def calibrated(
@@ -150,7 +132,7 @@ def calibrated(
     for walk, start in zip(walks, starts, strict=True):
         hops = hops_of(walk, name, floor)
         distance, off = _sight(walk, sensor, hops, start, settings)
-        counts = hops.valid & (np.abs(off) <= settings.off_axis) & (np.abs(hops.range_rates) >= settings.least_rate)
+        counts = counting(hops, off, settings)
         amplitudes.append(hops.amplitudes[counts])
         ranges.append(distance[counts])
     found = range_calibration(np.concatenate(amplitudes), np.concatenate(ranges), settings)

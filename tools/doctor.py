@@ -1,4 +1,4 @@
-"""`caneflow doctor`: what is wrong, and what to try next. So far of the devices: `--devices`."""
+"""`caneflow doctor`: what is wrong, and what to try next: with a running flow, or with the devices (`--devices`)."""
 
 import errno
 import getpass
@@ -9,14 +9,14 @@ import os
 import socket
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 import psutil
@@ -39,6 +39,8 @@ from caneflow.recording.sound_file import SoundFile
 from caneflow.runtime import Context, Quiet, Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.hosts.attach import DEFAULT_KEYS
+from caneflow.runtime.hosts.diagnosis import Finding, diagnosed
 
 TROUBLE_STATUS = 1
 PROBE_READS = 50
@@ -49,23 +51,23 @@ ANSWER_TIME = 0.5  # s, of a radar
 ASKED = 4  # times
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """One thing that was looked at."""
-
-    node: str
-    state: Literal["ok", "look", "bad"]
-    text: str
-    attempts: tuple[str, ...] = ()  # what to try next, the likeliest first
-
-
 def command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The dataflow whose devices are meant.")] = Path(
-        "dataflow.yaml"
-    ),
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="FLOW|FILE",
+            help="The running flow; by default the only one here. With --devices the file; by default dataflow.yaml.",
+        ),
+    ] = None,
     devices: Annotated[
         bool, typer.Option("--devices", help="Look at the devices; the flow must not be running.")
     ] = False,
+    at: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Where the flow runs, if not here: tcp/gateway.local:7447.")
+    ] = None,
+    keys: Annotated[
+        Path, typer.Option(metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
+    ] = DEFAULT_KEYS,
     machine: Annotated[str | None, typer.Option(metavar="NAME", help="Only those at this machine.")] = None,
     seconds: Annotated[float, typer.Option(min=0.5, help="s of samples to judge a device by.")] = 3.0,
     settings: Annotated[
@@ -74,28 +76,39 @@ def command(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
 ) -> None:
-    """Say whether each device is there, answers, how often it measures and how it is calibrated; else what to try.
+    """Say what is wrong with a running flow: links, nodes, wires, clocks (ms); or with the devices; and what to try.
 
+    Of a flow: who listens, who dials, who is denied, versions and clocks of its machines, where samples are lost. Of
+    each device (--devices): whether it is there, answers, how often it measures (Hz) and how it is calibrated.
     Exit status 0: nothing is bad. 1: something is.
+
+    Example: caneflow doctor cane
 
     Example: caneflow doctor --devices dataflow.yaml --set imu.port=/dev/ttyUSB0
     """
     if not devices:
-        raise CaneflowError("so far it looks at devices only; say --devices")
+        if settings or machine:
+            raise CaneflowError("--set and --machine are for devices; add --devices")
+        _told(diagnosed(what, at, keys), as_json=as_json)
+    file = Path(what or "dataflow.yaml")
     graph = load(file, settings or ())
     nodes = [node for node in graph.nodes.values() if _is_source(node) and machine in (None, node.machine)]
     if not nodes:
         raise CaneflowError(f"{file}: no node{f' at {machine}' if machine else ''} brings samples in")
-    findings = []
     logging.disable()  # a driver says in its own words what is said here
     try:
-        for node in nodes:
-            for finding in examined(node, seconds, graph.rig):
-                findings.append(finding)
-                if not as_json:
-                    print("\n".join(_lines(finding)), flush=True)
+        _told((finding for node in nodes for finding in examined(node, seconds, graph.rig)), as_json=as_json)
     finally:
         logging.disable(logging.NOTSET)
+
+
+def _told(found: Iterable[Finding], *, as_json: bool) -> NoReturn:
+    """Print the findings as they come, or all together as JSON."""
+    findings = []
+    for finding in found:
+        findings.append(finding)
+        if not as_json:
+            print("\n".join(_lines(finding)), flush=True)
     if as_json:
         print(json.dumps([asdict(finding) for finding in findings], indent=2))
     raise typer.Exit(TROUBLE_STATUS if any(finding.state == "bad" for finding in findings) else 0)

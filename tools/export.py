@@ -1,4 +1,4 @@
-"""`caneflow export`: a stream of a recording in a form that other programs read."""
+"""`caneflow export`: a recording, or a stream of it, in a form that other programs read."""
 
 import csv
 import sys
@@ -21,6 +21,11 @@ class Format(StrEnum):
 
     TUM = "tum"
     CSV = "csv"
+    FOXGLOVE = "foxglove"
+    ROSBAG2 = "rosbag2"
+
+
+TEXT = (Format.TUM, Format.CSV)  # one stream, readable; the others hold the whole recording
 
 
 def command(
@@ -30,22 +35,30 @@ def command(
         typer.Option(
             "--format",
             help="tum: a line per pose, `t x y z qx qy qz qw` in s and m, as evo reads it. "
-            "csv: a row per sample; stamp in ns, the rest in SI units and rad.",
+            "csv: a row per sample; stamp in ns, the rest in SI units and rad. "
+            "foxglove: an MCAP file for Foxglove and Rerun, with poses, transforms, numbers and pictures of the "
+            "range-Doppler map. rosbag2: a folder for ros2 bag, with sensor_msgs/Imu, geometry_msgs/PoseStamped, "
+            "TwistStamped and sensor_msgs/Image.",
         ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="File to write; by default standard output."),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="File or folder to write; tum and csv: by default standard output."
+        ),
     ] = None,
     stream: Annotated[
         str | None,
-        typer.Option(metavar="NODE/PORT", help="Stream to write; by default the only one that fits, truth aside."),
+        typer.Option(metavar="NODE/PORT", help="tum, csv: stream to write; by default the only one that fits."),
     ] = None,
 ) -> None:
-    """Write one stream of a recording as text.
+    """Write one stream of a recording as text (tum, csv), or all of it for other viewers (foxglove, rosbag2).
 
     Example: caneflow export track.mcap --format tum -o track.tum
     """
+    if form not in TEXT:
+        _export_whole(recording, form, output, stream)
+        return
     with Recording(recording) as source:
         chosen = _chosen(source, form, stream)
         samples = source.samples([(chosen.node, chosen.port)])
@@ -54,6 +67,31 @@ def command(
                 write_tum(samples, text)
             else:
                 write_csv(samples, text)
+
+
+def _export_whole(recording: Path, form: Format, output: Path | None, stream: str | None) -> None:
+    if output is None:
+        raise RecordingError(
+            f"--format {form}: needs -o, the {'folder' if form is Format.ROSBAG2 else 'file'} to write"
+        )
+    if stream is not None:
+        raise RecordingError(f"--format {form}: takes the whole recording; --stream is for tum and csv")
+    if output.exists() and output.samefile(recording):
+        raise RecordingError(f"{output}: is the recording itself; give another name")
+    with Recording(recording) as source:
+        if form is Format.FOXGLOVE:
+            from caneflow.recording.export_foxglove import export_foxglove  # here, as each brings its own library
+
+            written = export_foxglove(source, output)
+        else:
+            from caneflow.recording.export_rosbag2 import export_rosbag2
+
+            written = export_rosbag2(source, output)
+        left_out = [f"{node}/{port}" for node, port in source.streams if f"/{node}/{port}" not in written]
+    for topic, count in written.items():
+        print(f"{count:8d}  {topic}")
+    if left_out:
+        print(f"left out {', '.join(left_out)}: {form} has no form for it")
 
 
 def write_tum(samples: Iterable[Recorded], text: TextIO) -> None:

@@ -1,27 +1,39 @@
-"""The recorder: the node that `caneflow run --record OUT` adds; it writes every stream to one file."""
+"""The recorder: the node that `caneflow run --record OUT` adds; it writes every stream to one file, or to several."""
 
+import logging
+import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
+
 from caneflow.messages import Pose, Sample, sample_key
-from caneflow.recording import Recorded, Recording, RecordingWriter
+from caneflow.recording import Recorded, Recording, RecordingError, RecordingWriter, require_writable
+from caneflow.recording.parts import LastSeconds, RotatingWriter, Rotation, part_path
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.node import run
 
 TRUTH = ("truth", "pose")
+WRITE_NOW = b"write now"  # the one question that it answers
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordSettings:
-    """Where to write, and what to say of it."""
+    """Where to write, when to begin a new file, and what to say of it."""
 
     path: str
     flow: str
     source: Literal["live", "replayed"]
     rig: dict[str, Any]
     truth_from: str | None = None  # a replayed recording whose ground truth is carried over
+    rotate_bytes: int | None = None  # a new file when this one is as large
+    rotate_s: float | None = None  # s, a new file after this long
+    keep: int | None = None  # files; older ones of this run are removed
+    last_s: float | None = None  # s that are kept in memory, to be written when somebody asks; nothing else is
 
 
 class Recorder(Sink):
@@ -31,11 +43,12 @@ class Recorder(Sink):
 
     def __init__(self, settings: RecordSettings, context: Context) -> None:
         self._flow = settings.flow
-        self._writer = RecordingWriter(
-            Path(settings.path), flow=settings.flow, source=settings.source, rig=settings.rig
-        )
+        self._settings = settings
+        self._run = uuid.uuid4().hex
+        self._writer = self._writer_of(settings)
         self._truth = _truth(settings.truth_from)
         self._next_truth = next(self._truth, None)
+        self._warned = False
 
     def take(self, key: str, message: Sample, payload: bytes, time: int) -> None:
         """Write one sample, after the ground truth up to its stamp."""
@@ -46,13 +59,44 @@ class Recorder(Sink):
         """Write down what a node left out: a replay will leave it out as well."""
         self._writer.write_control(key, "caneflow.LeftOut/1", payload, log_time=time)
 
+    def asked(self, question: bytes, time: int) -> bytes | None:
+        """Write the last seconds to a file; the answer says which, or why not."""
+        if question != WRITE_NOW or not isinstance(self._writer, LastSeconds):
+            return None
+        try:
+            written = self._writer.snapshot()
+        except RecordingError as error:
+            return msgspec.json.encode({"error": str(error)})
+        log.info("%s: the last %.1f s, %d samples", written.path, written.span_s, written.samples)
+        about = {"path": str(written.path), "samples": written.samples, "span": written.span_s}
+        return msgspec.json.encode(about)
+
     def idle(self, time: int) -> None:
         """Bring what was written to the disk: a killed recorder loses at most a second."""
         self._writer.flush()
+        if isinstance(self._writer, LastSeconds) and self._writer.overfull and not self._warned:
+            self._warned = True
+            log.warning("the last %g s do not fit into memory; the oldest of them go", self._settings.last_s)
 
     def finish(self) -> None:
         """Complete the file."""
         self._writer.close()
+
+    def _writer_of(self, settings: RecordSettings) -> RecordingWriter | RotatingWriter | LastSeconds:
+        path = Path(settings.path)
+        if settings.last_s is not None:
+            require_writable(part_path(path, 0))
+            return LastSeconds(path, settings.last_s, self._part)
+        if settings.rotate_bytes is None and settings.rotate_s is None:
+            return RecordingWriter(path, flow=settings.flow, source=settings.source, rig=settings.rig, run=self._run)
+        rotation = Rotation(size=settings.rotate_bytes, span_s=settings.rotate_s, keep=settings.keep)
+        return RotatingWriter(path, rotation, self._part)
+
+    def _part(self, path: Path, number: int) -> RecordingWriter:
+        settings = self._settings
+        return RecordingWriter(
+            path, flow=settings.flow, source=settings.source, rig=settings.rig, run=self._run, part=number
+        )
 
     def _carry_truth(self, until: int, time: int) -> None:
         while (truth := self._next_truth) is not None and truth.stamp <= until:

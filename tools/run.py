@@ -9,11 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from caneflow.messages.control import Counters
+from caneflow.recording.parts import Rotation, read_span
+from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.loading import load, read_rig
 from caneflow.runtime.deployment import Deployment, Replay, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.hosts.launch import Launcher, Outcome
+from caneflow.runtime.wording import listed
 
 
 def command(
@@ -36,7 +39,25 @@ def command(
     in_process: Annotated[
         bool, typer.Option("--in-process", help="all nodes in this process, as fast as the processor allows")
     ] = False,
+    machine: Annotated[
+        str | None, typer.Option(metavar="NAME", help="start what runs on this machine of the flow, with the others")
+    ] = None,
+    keys: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="with --machine: this machine's certificate [default: keys, beside the file]"),
+    ] = None,
     record: Annotated[Path | None, typer.Option(metavar="OUT", help="write every stream to this recording")] = None,
+    rotate: Annotated[
+        str | None,
+        typer.Option(metavar="100MB|10min", help="of --record: begin OUT_000, OUT_001 ... by size, time or both"),
+    ] = None,
+    keep: Annotated[int | None, typer.Option(metavar="N", min=1, help="of --rotate: keep only the newest N")] = None,
+    record_last: Annotated[
+        str | None,
+        typer.Option(
+            metavar="30s", help="of --record: keep the last 30 s in memory; `caneflow record --now` writes them"
+        ),
+    ] = None,
     rig: Annotated[
         Path | None, typer.Option(metavar="YAML", help="a rig to lay over the recording's and the file's")
     ] = None,
@@ -57,13 +78,23 @@ def command(
         print(warning, file=sys.stderr)
     speed = speed or ("max" if in_process else "1")
     played = _replay(replay, speed, start, duration, loop=loop, without=without or [])
-    deployment = deploy(graph, replay=played, record=record, rig=_rig(rig))
+    recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
+    _check_machine(graph, machine, everything_here=in_process or played is not None)
+    deployment = deploy(
+        graph,
+        replay=played,
+        record=record,
+        recorder=recorder,
+        rig=_rig(rig),
+        machine=None if in_process else machine,
+    )
     started = time.monotonic()
     if in_process:
         programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
         outcome = InProcess(deployment, programs).run()
     else:
-        outcome = Launcher(deployment, {name: node.restart for name, node in graph.nodes.items()}, report).run()
+        restarts = {name: node.restart for name, node in graph.nodes.items()}
+        outcome = Launcher(deployment, restarts, report, keys or file.parent / "keys").run()
     summary(deployment, outcome, time.monotonic() - started)
     raise typer.Exit(outcome.status)
 
@@ -95,6 +126,35 @@ def _counted(counters: Counters) -> str:
     if counters.refused:
         troubles.append(f"{counters.refused} refused")
     return "; ".join(filter(None, [", ".join(given), *troubles]))
+
+
+def _recorder(
+    record: Path | None, rotate: str | None, keep: int | None, last: str | None, *, in_process: bool
+) -> dict[str, Any]:
+    """The recorder's settings that the options ask for."""
+    if record is None and (rotate or keep or last):
+        raise DataflowError("--rotate, --keep and --record-last say how to record; add --record OUT")
+    if last is not None and (rotate or keep):
+        raise DataflowError(
+            "--record-last writes a file whenever it is asked to; --rotate and --keep do not go with it"
+        )
+    if last is not None and in_process:
+        raise DataflowError("--record-last needs a flow that can be asked: leave --in-process out")
+    if keep is not None and rotate is None:
+        raise DataflowError(f"--keep {keep}: says how many files of --rotate are kept; add e.g. --rotate 100MB")
+    if last is not None:
+        return {"last_s": read_span(last)}
+    if rotate is None:
+        return {}
+    rotation = Rotation.read(rotate, keep)
+    return {"rotate_bytes": rotation.size, "rotate_s": rotation.span_s, "keep": rotation.keep}
+
+
+def _check_machine(graph: Graph, machine: str | None, *, everything_here: bool) -> None:
+    """A live flow of several machines needs to know which one this is; a replay may run as a whole anywhere."""
+    used = {node.machine for node in graph.nodes.values()}
+    if machine is None and len(used) > 1 and not everything_here:
+        raise DataflowError(f"{graph.path}: runs on several machines; give --machine, one of {listed(graph.machines)}")
 
 
 def _replay(

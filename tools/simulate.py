@@ -12,11 +12,12 @@ from rich.progress import Progress
 from caneflow.messages import DopplerBlock, Imu, Pose, RadarFrame, Sample, numbered, sample_key
 from caneflow.recording import TRUTH, RecordingWriter, require_writable
 from caneflow.simulation.doppler_module import Kind
+from caneflow.simulation.room_cane import CaneInRoom, simulate_cane_in_room
 from caneflow.simulation.room_course import RoomShape
 from caneflow.simulation.room_scenario import PARTS, SENSORS, Part, RoomRecording, World, room_settings, simulate_room
 from caneflow.simulation.scenario import SCENARIOS, Walk, simulate_walk
 
-CANE, ROOM = "cane", "room"  # flows
+CANE, ROOM, CANE_IN_ROOM = "cane", "room", "cane_in_room"  # flows
 IMU, RADAR = ("imu", "imu"), ("radar", "frame")
 
 Samples: TypeAlias = Iterator[tuple[tuple[str, str], int, Sample]]  # node and port, number within the stream, sample
@@ -86,6 +87,27 @@ def room(
         print(f"{path}: {one}, seed {seed}: {blocks} blocks a module, {len(recorded.stamps_ns) / 100:.2f} s")
 
 
+def cane_in_room(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="REC", help="Recording to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of installation, person, cane and walk.")] = 1,
+    modules: Annotated[Kind, typer.Option(help="One mixer (int16) or two (complex64).")] = "real",
+    sensors: Annotated[int, typer.Option(min=2, max=len(SENSORS), help=f"The first of {', '.join(SENSORS)}.")] = 2,
+    world: Annotated[World, typer.Option(help="How strongly floor and walls reflect.")] = "nominal",
+) -> None:
+    """Simulate somebody with a white cane in a room of Doppler modules: both sensor sets, and where the person was.
+
+    The installation is that of `simulate room` with the same seed, whose empty room and walks calibrate it.
+
+    Example: caneflow simulate cane_in_room --seed 3 -o cane_3.mcap
+    """
+    settings = room_settings(modules=modules, sensors=sensors, world=world)
+    require_writable(output)
+    with progress_bar(f"cane in room, seed {seed}") as progress:
+        walked = simulate_cane_in_room(settings, seed, progress=progress)
+    written(output, CANE_IN_ROOM, walked.rig, cane_in_room_samples(walked))
+    print(f"{output}: cane in room, seed {seed}: {len(walked.room.stamps_ns) / 100:.2f} s")
+
+
 def room_names(output: Path, name: str, part: Literal[Part, "all"]) -> dict[Part, Path]:
     """The file of each part that is asked for. A folder is made where there is none; one part may have any name."""
     base = output
@@ -108,35 +130,53 @@ def written(output: Path, flow: str, rig: Mapping[str, object], samples: Samples
 
 def samples_of(walked: Walk) -> Samples:
     """At each instant what the IMU and the radar say, and the truth."""
-    imu = walked.imu
-    for i, stamp in enumerate(walked.stamps_ns.tolist()):
-        yield (
-            IMU,
-            i,
-            Imu(
-                stamp=stamp,
-                gyro=tuple(imu.gyro[i].tolist()),
-                accel=tuple(imu.accel[i].tolist()),
-                mag=tuple(imu.mag[i].tolist()),
-                orientation=tuple(imu.orientation[i].tolist()),
-                linear_accel=tuple(imu.linear_accel[i].tolist()),
-                calibration=tuple(imu.calibration[i].tolist()),
-            ),
-        )
-        yield (
-            RADAR,
-            i,
-            RadarFrame(
-                stamp=stamp,
-                scans=walked.scans[i : i + 1],
-                scan_period=walked.scan_period,
-                range_start=walked.range_start,
-                range_step=walked.range_step,
-                carrier=walked.carrier,
-                bandwidth=walked.bandwidth,
-            ),
-        )
+    for i in range(len(walked.stamps_ns)):
+        yield from cane_samples(walked, i)
         yield TRUTH, i, true_pose(walked, i)
+
+
+def cane_samples(walked: Walk, i: int) -> Samples:
+    """What the cane's IMU and radar say at instant `i`."""
+    imu, stamp = walked.imu, int(walked.stamps_ns[i])
+    yield (
+        IMU,
+        i,
+        Imu(
+            stamp=stamp,
+            gyro=tuple(imu.gyro[i].tolist()),
+            accel=tuple(imu.accel[i].tolist()),
+            mag=tuple(imu.mag[i].tolist()),
+            orientation=tuple(imu.orientation[i].tolist()),
+            linear_accel=tuple(imu.linear_accel[i].tolist()),
+            calibration=tuple(imu.calibration[i].tolist()),
+        ),
+    )
+    yield (
+        RADAR,
+        i,
+        RadarFrame(
+            stamp=stamp,
+            scans=walked.scans[i : i + 1],
+            scan_period=walked.scan_period,
+            range_start=walked.range_start,
+            range_step=walked.range_step,
+            carrier=walked.carrier,
+            bandwidth=walked.bandwidth,
+        ),
+    )
+
+
+def cane_in_room_samples(walked: CaneInRoom) -> Samples:
+    """What the cane and the modules say, and where the person truly was, in the order of the stamps."""
+    seen, block = walked.room, 0
+    for i, stamp in enumerate(seen.stamps_ns.tolist()):
+        while block < len(seen.block_stamps_ns) and seen.block_stamps_ns[block] < stamp:
+            yield from module_samples(seen, block)
+            block += 1
+        yield from cane_samples(walked.cane, i)
+        yield TRUTH, i, true_pose(seen, i)
+    for last in range(block, len(seen.block_stamps_ns)):
+        yield from module_samples(seen, last)
 
 
 def room_samples(recorded: RoomRecording) -> Samples:
@@ -194,4 +234,4 @@ def progress_bar(text: str) -> Iterator[Callable[[float], None]]:
         yield lambda done: bar.update(task, completed=done)
 
 
-commands = {"walk": walk, "room": room}
+commands = {"walk": walk, "room": room, "cane_in_room": cane_in_room}

@@ -4,7 +4,8 @@ import sys
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Annotated, Any, NoReturn
+from inspect import cleandoc
+from typing import Annotated, Any, NoReturn, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -14,6 +15,8 @@ from caneflow.errors import CaneflowError
 
 TOOLS = "caneflow.tools"
 USAGE_STATUS = 2  # exit status of an expected error, as of a misspelt option
+# UsageError, which typer does not name: of click, or of its own copy of click.
+MISUSE = cast(type[Exception], typer.BadParameter.__mro__[1])
 INTERRUPTED_STATUS = 130  # 128 + SIGINT, as a shell reports Ctrl-C
 
 # Word -> module in tools, one line of help. A tool has `command`, a function whose annotations are its options, or
@@ -38,6 +41,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "emulate": ("emulate", "Play a device from a recording, for a driver to talk to."),
     "eval": ("evaluate", "Compare methods over recordings with ground truth."),
     "experiments": ("experiments", "Make the paper's experiments on simulated walks."),
+    "ablation": ("ablation", "Find what each measurement of the room tracker is worth."),
     "bench": ("bench", "Measure how fast a recording runs, and where the time goes."),
     "calibrate": ("calibrate", "Fit the rig to recordings."),
     "plot": ("plot", "Draw a recording's track and speed."),
@@ -61,10 +65,20 @@ class Word(TyperCommand):
         return _tool(self._module).make_context(info_name, args, parent, **extra)
 
 
+class Door(TyperGroup):
+    """The command itself."""
+
+    def invoke(self, ctx: Any) -> None:
+        """Run the word's tool; what a tool returns is not for the shell."""
+        super().invoke(ctx)
+
+
 def main() -> NoReturn:
     """Run the command line's word; exit status 2 and one line for an expected error, a traceback for a bug."""
     try:
-        _command().main(prog_name="caneflow")
+        status = _command().main(prog_name="caneflow", standalone_mode=False)
+    except MISUSE as error:
+        _explain(error)
     except CaneflowError as error:
         if getattr(error, "problems", ()):  # each line begins with its own file:line:column
             print(error, file=sys.stderr)
@@ -76,7 +90,19 @@ def main() -> NoReturn:
         _fail(f"{error.filename}: {error.strerror}")
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED_STATUS)
-    sys.exit()
+    sys.exit(status)  # of a typer.Exit, or None
+
+
+def _explain(error: Any) -> NoReturn:
+    """What is wrong with the command line, in one line; or the help, when nothing was said at all."""
+    context = error.ctx
+    if len(sys.argv) == 1 or context is None:
+        error.show()
+    else:
+        words = " ".join(error.format_message().split()).removesuffix(".")
+        joint = " See" if words.endswith("?") else "; see"
+        print(f"{context.command_path}: {words}{joint} `{context.command_path} --help`", file=sys.stderr)
+    sys.exit(USAGE_STATUS)
 
 
 def _fail(message: str) -> NoReturn:
@@ -86,7 +112,7 @@ def _fail(message: str) -> NoReturn:
 
 
 def _command() -> TyperGroup:
-    app = _typer(no_args_is_help=True)
+    app = _typer(no_args_is_help=True, cls=Door)
     app.callback()(_caneflow)
     group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup)
@@ -127,10 +153,20 @@ def _tool(module: str) -> Any:
         app.callback(help=tool.__doc__)(_no_options)
         for word, function in tool.commands.items():
             # A second word may have a module of its own: programs do not import each other.
-            app.command(word)(import_module(f"{TOOLS}.{function}").command if isinstance(function, str) else function)
+            chosen = import_module(f"{TOOLS}.{function}").command if isinstance(function, str) else function
+            app.command(word, help=_flowing(chosen.__doc__))(chosen)
     else:
-        app.command()(tool.command)
+        app.command(help=_flowing(tool.command.__doc__))(tool.command)
     return typer.main.get_command(app)
+
+
+def _flowing(text: str | None) -> str | None:
+    """A docstring for any width of the terminal: its lines end where the source's did, paragraph by paragraph."""
+    if text is None:
+        return None
+    paragraphs = cleandoc(text).split("\n\n")
+    kept = ("\n ", "\\\n", "\b")  # lines that are indented, or go on on the next: laid out by hand
+    return "\n\n".join(each if any(mark in each for mark in kept) else " ".join(each.split()) for each in paragraphs)
 
 
 def _no_options() -> None:

@@ -6,13 +6,16 @@ the person has all but stopped.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
+from caneflow.algorithms.doppler_line import DopplerLineSettings, predominant_line
+from caneflow.algorithms.doppler_spectrum import DopplerSpectrum
 from caneflow.algorithms.room_tracking import StaticSensor
 
 Floats = NDArray[np.float64]
@@ -39,6 +42,35 @@ class RangeCalibration:
     spread: float  # dB, half of what lies between the 16th and 84th percentile of P R^4
     exponent: float  # n of P = k / R^n that would fit best; 4 in the free field
     hops: int  # how many there were
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hops:
+    """What one sensor's front end saw of one walk, by hop."""
+
+    stamps: NDArray[np.int64]  # shape (H,), ns, of what the value belongs to
+    range_rates: Floats  # shape (H,), m/s
+    amplitudes: Floats  # shape (H,), full scale = 1
+    valid: NDArray[np.bool_]  # shape (H,)
+    signed: bool
+
+
+def hops_over(spectra: Sequence[tuple[int, DopplerSpectrum]], floor: Floats) -> Hops:
+    """The predominant lines of at least one spectrum, each with its time (ns), over the empty room's floor (B,)."""
+    lines = [predominant_line(replace(each, floor=floor), DopplerLineSettings()) for _, each in spectra]
+    return Hops(
+        stamps=np.array([stamp for stamp, _ in spectra], dtype=np.int64),
+        range_rates=np.array([line.range_rate for line in lines]),
+        amplitudes=np.array([line.amplitude for line in lines]),
+        valid=np.array([line.valid for line in lines], dtype=np.bool_),
+        signed=spectra[0][1].signed,
+    )
+
+
+def counting(hops: Hops, off: Floats, settings: CalibrationSettings) -> NDArray[np.bool_]:
+    """Which hops tell of k, shape (H,): valid ones along the beam, `off` rad from the sensor's axis."""
+    rates = np.abs(hops.range_rates)
+    return np.asarray(hops.valid & (np.abs(off) <= settings.off_axis) & (rates >= settings.least_rate))
 
 
 def range_calibration(amplitudes: Floats, ranges: Floats, settings: CalibrationSettings) -> RangeCalibration | None:

@@ -9,7 +9,8 @@ State, in this order, n = 6 + number of sensors:
     b_i     dB, what sensor i receives more than its k says: aspect, reflections, an imperfect calibration
 
 Between echoes the velocity turns with the IMU's yaw, so that an abrupt turn costs nothing; across the heading it is
-measured to be 0. Without an IMU it is a random walk.
+measured to be 0. Without an IMU it is a random walk. Where the person's own dead reckoning is known (a cane's), the
+position goes its way and the velocity is its velocity, both turned by beta, which then is its error of yaw.
 """
 
 import math
@@ -26,10 +27,11 @@ from caneflow.algorithms.room_tracking import (
     LEAST_DISTANCE,
     Echo,
     HeadingHistory,
+    MotionWatch,
     RoomEstimate,
     RoomStart,
-    SilenceWatch,
     StaticSensor,
+    WayHistory,
     pattern_loss,
 )
 
@@ -44,6 +46,7 @@ class RoomEkfSettings:
     use_speed: bool = True
     use_strength: bool = True
     use_heading: bool = True
+    use_steps: bool = True  # the IMU's steps tell standing from lost; false, or no accelerometer: the sensors must
     walk_noise: Annotated[float, Gt(0)] = 1.1  # m/s/sqrt(s), without an IMU, on each axis
     walk_time: Annotated[float, Gt(0)] = 2.0  # s, in which it comes back to 0
     along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), with an IMU, along the heading
@@ -66,10 +69,16 @@ class RoomEkfSettings:
     edge_error: Annotated[float, Gt(0)] = 1.0  # m, sd of how far beyond the area's edge somebody may be
     degrees: Annotated[float, Gt(2)] = 4.0  # of freedom of the Student-t that all errors are taken to have
     gate: Annotated[float, Gt(1)] = 5.0  # sd beyond which a measurement is discarded
+    way_noise: Annotated[float, Gt(0)] = 0.1  # m/sqrt(s), of dead reckoning
+    way_turn_noise: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/sqrt(s), of its yaw: iron in a room, or drift
+    way_time: Annotated[float, Gt(0)] = 0.8  # s over which its velocity is averaged: a cane swings
+    way_speed_error: Annotated[float, Gt(0)] = 0.25  # m/s, sd of each component of that mean, in a bend above all
     hold_after: Annotated[float, Gt(0)] = 0.7  # s with hardly a valid echo, after which the position is held
     hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
     hold_speed: Annotated[float, Ge(0)] = 0.3  # m/s, sd of each component of the velocity then
     hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
+    set_off_speed: Annotated[float, Ge(0)] = 0.5  # m/s along the heading, with an IMU, of who begins to walk
+    set_off_error: Annotated[float, Gt(0)] = 0.4  # m/s, its sd
     start_speed: Annotated[float, Gt(0)] = 0.7  # m/s, sd of each component before anything is known
     heading_timeout: Annotated[float, Gt(0)] = 0.5  # s, after which the IMU counts as silent
 
@@ -88,9 +97,11 @@ class RoomEkf:
         self._place = {name: BIASES + index for index, name in enumerate(self._sensors)}
         self._area = start.area
         self._headings = HeadingHistory()
-        self._silence = SilenceWatch(settings.hold_after)
+        self._way = WayHistory()
+        self._motion = MotionWatch(settings.hold_after, settings.heading_timeout)
         self._now_ns: int | None = None
         self._crossed_ns: int | None = None  # when the heading was last used
+        self._held = False  # whether the person did not move, the last time
         self.discarded = 0
         size = BIASES + len(self._sensors)
         self._state = np.zeros(size)
@@ -109,21 +120,28 @@ class RoomEkf:
     @property
     def moving(self) -> bool:
         """Whether some sensor has seen something move not long before."""
-        return self._now_ns is None or self._silence.moving(self._now_ns)
+        return self._now_ns is None or self._motion.moving(self._now_ns)
 
-    def heading(self, stamp_ns: int, yaw: float) -> None:
-        """Take the direction that the person faces, rad in R0."""
+    def heading(self, stamp_ns: int, yaw: float, standing: bool | None = None) -> None:
+        """Take the direction that the person faces, rad in R0, and whether they stand, where it is known."""
         if self._settings.use_heading:
             self._headings.add(stamp_ns, yaw)
+            self._motion.steps(stamp_ns, standing if self._settings.use_steps else None)
+
+    def walked(self, stamp_ns: int, place: tuple[float, float]) -> None:
+        """Take where the person is by dead reckoning of their own, m, axes as R0, origin anywhere."""
+        self._way.add(stamp_ns, place)
 
     def echo(self, sensor: str, echo: Echo) -> None:
         """Take what a sensor saw."""
-        self._silence.update(echo.stamp_ns, echo.valid)
+        self._motion.echo(echo.stamp_ns, echo.valid)
         self._advance(echo.stamp_ns)
         if not echo.valid:
             return
         if echo.range is not None:
             self._take_range(self._sensors[sensor], echo.range)
+        if self._motion.standing(echo.stamp_ns):  # a limb, a sway, or noise
+            return
         if self._settings.use_strength and echo.strength is not None:
             self._take_strength(sensor, echo.strength)
         if self._settings.use_speed:
@@ -133,7 +151,7 @@ class RoomEkf:
         """The state, predicted to `stamp_ns`."""
         state, covariance = self._state, self._covariance
         if self._now_ns is not None and stamp_ns > self._now_ns:
-            state, covariance = self._predicted(stamp_ns, self.moving)
+            state, covariance = self._predicted(stamp_ns, self._motion.moving(stamp_ns))
         return RoomEstimate(
             (float(state[X]), float(state[Y])), (float(state[U]), float(state[V])), covariance[:4, :4].copy()
         )
@@ -144,15 +162,21 @@ class RoomEkf:
             return
         if stamp_ns <= self._now_ns:
             return
-        moving = self._silence.moving(stamp_ns)
+        moving = self._motion.moving(stamp_ns)
         self._state, self._covariance = self._predicted(stamp_ns, moving)
         self._now_ns = stamp_ns
-        if moving and self._heading_known(stamp_ns):
+        if moving and self._heading_known(stamp_ns) and not self._way_known(stamp_ns):
+            if self._held:
+                self._set_off(stamp_ns)
             self._take_heading(stamp_ns)
+        self._held = not moving
         self._stay_inside()
 
     def _heading_known(self, stamp_ns: int) -> bool:
         return self._headings.age(stamp_ns) < self._settings.heading_timeout
+
+    def _way_known(self, stamp_ns: int) -> bool:
+        return self._way.age(stamp_ns) < self._settings.heading_timeout
 
     def _predicted(self, stamp_ns: int, moving: bool) -> tuple[Array, Array]:
         assert self._now_ns is not None
@@ -160,14 +184,19 @@ class RoomEkf:
         dt = (stamp_ns - self._now_ns) * 1e-9
         size = len(self._state)
         f, q, drift = np.eye(size), np.zeros((size, size)), np.zeros(size)
-        if not moving:
+        if self._way_known(stamp_ns):
+            self._go_the_way(stamp_ns, dt, f, q, drift)
+        elif not moving:
             self._hold(dt, f, q)
         elif self._heading_known(stamp_ns):
             self._walk_along(stamp_ns, dt, f, q, drift)
         else:
             self._walk_anywhere(dt, f, q)
-        f[BETA, BETA] = math.exp(-dt / s.yaw_time)
-        q[BETA, BETA] = (1.0 - f[BETA, BETA] ** 2) * s.yaw_error**2
+        if self._way_known(stamp_ns):
+            q[BETA, BETA] = s.way_turn_noise**2 * dt
+        else:
+            f[BETA, BETA] = math.exp(-dt / s.yaw_time)
+            q[BETA, BETA] = (1.0 - f[BETA, BETA] ** 2) * s.yaw_error**2
         keep = math.exp(-dt / s.bias_time)
         for place in self._place.values():
             f[place, place] = keep
@@ -213,17 +242,49 @@ class RoomEkf:
         q[U, V] = q[V, U] = (a - b) * c * n
         q[X, X], q[Y, Y] = q[U, U] * dt * dt / 3.0, q[V, V] * dt * dt / 3.0
 
+    def _go_the_way(self, stamp_ns: int, dt: float, f: Array, q: Array, drift: Array) -> None:
+        """With dead reckoning: its way and its velocity, turned by beta."""
+        assert self._now_ns is not None
+        s = self._settings
+        beta = float(self._state[BETA])
+        c, n = math.cos(beta), math.sin(beta)
+        f[U, U] = f[V, V] = 0.0
+        east, north = self._way.between(self._now_ns, stamp_ns)
+        u, v = self._way.velocity(stamp_ns, round(s.way_time * 1e9))
+        for place, (x, y) in ((X, (east, north)), (U, (u, v))):
+            ahead, aside = c * x - n * y, n * x + c * y
+            f[place, BETA], f[place + 1, BETA] = -aside, ahead
+            drift[place], drift[place + 1] = ahead + aside * beta, aside - ahead * beta
+        q[X, X] = q[Y, Y] = s.way_noise**2 * dt
+        q[U, U] = q[V, V] = s.way_speed_error**2
+
+    def _set_off(self, stamp_ns: int) -> None:
+        """Whoever walks again walks ahead: what was left of the velocity says nothing, and its sign may be wrong."""
+        s = self._settings
+        yaw = self._headings.travel(stamp_ns, stamp_ns).yaw + float(self._state[BETA])
+        c, n = math.cos(yaw), math.sin(yaw)
+        self._state[U], self._state[V] = s.set_off_speed * c, s.set_off_speed * n
+        a, b = s.set_off_error**2, s.across_speed**2
+        self._covariance[[U, V], :] = self._covariance[:, [U, V]] = 0.0
+        self._covariance[U, U], self._covariance[V, V] = a * c * c + b * n * n, a * n * n + b * c * c
+        self._covariance[U, V] = self._covariance[V, U] = (a - b) * c * n
+
     def _take_heading(self, stamp_ns: int) -> None:
-        """The velocity is along the heading: what it has across is 0."""
+        """The velocity is along the heading: what it has across is 0, and what it has along is not negative."""
         dt = 0.05 if self._crossed_ns is None else (stamp_ns - self._crossed_ns) * 1e-9
         self._crossed_ns = stamp_ns
         yaw = self._headings.travel(stamp_ns, stamp_ns).yaw + float(self._state[BETA])
         c, n = math.cos(yaw), math.sin(yaw)
         u, v = float(self._state[U]), float(self._state[V])
+        # one measurement of this error per 0.25 s, however often it is made
+        noise = self._settings.across_speed**2 * 0.25 / max(dt, 1e-3)
         h = np.zeros(len(self._state))
         h[U], h[V], h[BETA] = -n, c, -(c * u + n * v)
-        # one measurement of this error per 0.25 s, however often it is made
-        self._correct(h, n * u - c * v, self._settings.across_speed**2 * 0.25 / max(dt, 1e-3))
+        self._correct(h, n * u - c * v, noise)
+        along = c * float(self._state[U]) + n * float(self._state[V])
+        if along < 0.0:  # nobody walks backwards for long; and the sensors' mirror image is walked in just so
+            h[U], h[V], h[BETA] = c, n, c * v - n * u
+            self._correct(h, -along, noise)
 
     def _stay_inside(self) -> None:
         """Whoever is found outside of the area is drawn to its edge."""

@@ -30,9 +30,9 @@ from caneflow.algorithms.room_tracking import (
     PATTERN_EXPONENT,
     Echo,
     HeadingHistory,
+    MotionWatch,
     RoomEstimate,
     RoomStart,
-    SilenceWatch,
     StaticSensor,
 )
 
@@ -47,19 +47,19 @@ class RoomParticleSettings:
     use_strength: bool = True
     use_heading: bool = True
     particles: ParticleSettings = field(default_factory=ParticleSettings)
-    walk_noise: Annotated[float, Gt(0)] = 1.0  # m/s/sqrt(s), on each axis
+    walk_noise: Annotated[float, Gt(0)] = 0.5  # m/s/sqrt(s), on each axis: a bend and a change of pace
     along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), of the speed along the heading
     fastest: Annotated[float, Gt(0)] = 2.0  # m/s
     start_speed: Annotated[float, Ge(0)] = 0.7  # m/s, sd of each component
     speed_error: Annotated[float, Gt(0)] = 0.12  # m/s
     speed_outliers: Annotated[float, Ge(0), Le(1)] = 0.1
-    speed_share: Annotated[float, Gt(0), Le(1)] = 0.35  # of an echo that is new: windows overlap
+    speed_share: Annotated[float, Gt(0), Le(1)] = 0.5  # of an echo that is new: windows overlap
     strength_error: Annotated[float, Gt(0)] = 5.0  # dB
-    strength_share: Annotated[float, Gt(0), Le(1)] = 0.3
+    strength_share: Annotated[float, Gt(0), Le(1)] = 0.2
     degrees: Annotated[float, Gt(0)] = 4.0  # of freedom of the strength's Student-t
     range_error: Annotated[float, Gt(0)] = 0.1  # m, of sensors that measure it
     heading_error: Annotated[float, Gt(0)] = math.radians(7.0)  # rad
-    heading_share: Annotated[float, Gt(0), Le(1)] = 0.1
+    heading_share: Annotated[float, Gt(0), Le(1)] = 0.025  # its error lasts for seconds, an update for 50 ms
     heading_time: Annotated[float, Gt(0)] = 20.0  # s, correlation of the yaw's error
     turn_noise: Annotated[float, Gt(0)] = 1.0  # rad/sqrt(s), of a heading that nobody measures
     edge_share: Annotated[float, Ge(0)] = 0.5  # 1/m^2: how fast it becomes unlikely to be outside of the area
@@ -74,6 +74,8 @@ class RoomParticleSettings:
 class _RoomParticles(ABC):
     """What both filters share; a subclass says what a state is and how it goes on."""
 
+    _feels_steps = False  # whether it listens to the IMU for steps; the paper's identifies who stands by the sensors
+
     def __init__(
         self,
         settings: RoomParticleSettings,
@@ -86,7 +88,7 @@ class _RoomParticles(ABC):
         self._area = start.area
         self._random = random
         self._headings = HeadingHistory()
-        self._silence = SilenceWatch(settings.hold_after)
+        self._motion = MotionWatch(settings.hold_after, settings.heading_timeout)
         self._now_ns: int | None = None
         self.discarded = 0
         self._particles = Particles(self._drawn(start, settings.particles.count), settings.particles)
@@ -94,18 +96,19 @@ class _RoomParticles(ABC):
     @property
     def moving(self) -> bool:
         """Whether some sensor has seen something move not long before."""
-        return self._now_ns is None or self._silence.moving(self._now_ns)
+        return self._now_ns is None or self._motion.moving(self._now_ns)
 
-    def heading(self, stamp_ns: int, yaw: float) -> None:
-        """Take the direction that the person faces, rad in R0."""
+    def heading(self, stamp_ns: int, yaw: float, standing: bool | None = None) -> None:
+        """Take the direction that the person faces, rad in R0, and whether they stand, where it is known."""
         if self._settings.use_heading:
             self._headings.add(stamp_ns, yaw)
+            self._motion.steps(stamp_ns, standing if self._feels_steps else None)
 
     def echo(self, sensor: str, echo: Echo) -> None:
         """Take what a sensor saw: one pass of Algorithm 1's loop."""
-        self._silence.update(echo.stamp_ns, echo.valid)
+        self._motion.echo(echo.stamp_ns, echo.valid)
         self._advance(echo.stamp_ns)
-        if echo.valid:
+        if echo.valid and (echo.range is not None or not self._motion.standing(echo.stamp_ns)):
             self._weigh(self._sensors[sensor], echo)
 
     @abstractmethod
@@ -139,7 +142,7 @@ class _RoomParticles(ABC):
         if self._particles.renew(self._random):  # once all that was seen at one time has been weighed
             self._roughen()
         dt = (stamp_ns - self._now_ns) * 1e-9
-        if self._silence.moving(stamp_ns):
+        if self._motion.moving(stamp_ns):
             self._move(stamp_ns, dt)
         else:
             self._hold(dt)
@@ -225,6 +228,8 @@ class ParticleTracker(_RoomParticles):
 class HeadingParticleTracker(_RoomParticles):
     """States x, y, speed (m/s), and the heading of travel less the IMU's yaw (rad); without an IMU, all of it."""
 
+    _feels_steps = True
+
     def _drawn(self, start: RoomStart, count: int) -> Array:
         s = self._settings
         speed = np.abs(math.sqrt(2.0) * s.start_speed * self._random.standard_normal(count))
@@ -269,7 +274,7 @@ class HeadingParticleTracker(_RoomParticles):
         particles = self._particles
         velocities = self._velocities()
         positions, forward = particles.states[:2], velocities
-        if self._now_ns is not None and self.moving and stamp_ns > self._now_ns:
+        if self._now_ns is not None and stamp_ns > self._now_ns and self.moving:
             dt = (stamp_ns - self._now_ns) * 1e-9
             ahead = np.stack([dt * velocities[0], dt * velocities[1]])
             if self._heading_known(stamp_ns):

@@ -86,14 +86,17 @@ class RoomTracker(Protocol):
 
     @property
     def moving(self) -> bool:
-        """Whether anything tells that the person moves: no, if all sensors are below their thresholds."""
+        """Whether the person moves: no, if all sensors are below their thresholds, or an IMU feels no steps."""
 
     @property
     def discarded(self) -> int:
         """How many measurements were inconsistent and left out."""
 
-    def heading(self, stamp_ns: int, yaw: float) -> None:
-        """Take the direction that the person faces, rad in R0; in the order of time."""
+    def heading(self, stamp_ns: int, yaw: float, standing: bool | None = None) -> None:
+        """Take the direction that the person faces, rad in R0, and whether they stand, where it is known.
+
+        In the order of time.
+        """
 
     def echo(self, sensor: str, echo: Echo) -> None:
         """Take what a sensor saw."""
@@ -167,6 +170,49 @@ class HeadingHistory:
         return self._east[at] + elapsed * math.cos(middle), self._north[at] + elapsed * math.sin(middle), yaw
 
 
+class WayHistory:
+    """The last positions by dead reckoning, in a frame whose origin is anywhere."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[int] = deque(maxlen=HISTORY)
+        self._places: deque[Vector2] = deque(maxlen=HISTORY)
+
+    def add(self, stamp_ns: int, place: Vector2) -> None:
+        """Append a position, m; raises ValueError when time does not go on."""
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            raise ValueError(f"position at {stamp_ns} ns is not after the one before, {self._stamps[-1]} ns")
+        self._stamps.append(stamp_ns)
+        self._places.append(place)
+
+    def between(self, start_ns: int, end_ns: int) -> Vector2:
+        """The way from one time to another, m; before the first and after the last position one stands."""
+        x0, y0 = self._at(start_ns)
+        x1, y1 = self._at(end_ns)
+        return x1 - x0, y1 - y0
+
+    def velocity(self, stamp_ns: int, span_ns: int) -> Vector2:
+        """m/s, the mean from `span_ns` before a time to the last position."""
+        start = max(stamp_ns - span_ns, self._stamps[0])
+        elapsed = (self._stamps[-1] - start) * 1e-9
+        if elapsed <= 0.0:
+            return 0.0, 0.0
+        x, y = self.between(start, self._stamps[-1])
+        return x / elapsed, y / elapsed
+
+    def age(self, stamp_ns: int) -> float:
+        """Seconds since the last position; infinite when there is none."""
+        return (stamp_ns - self._stamps[-1]) * 1e-9 if self._stamps else math.inf
+
+    def _at(self, stamp_ns: int) -> Vector2:
+        after = bisect_right(self._stamps, stamp_ns)
+        if after == 0 or after == len(self._stamps):
+            return self._places[max(after - 1, 0)]
+        before = self._stamps[after - 1]
+        share = (stamp_ns - before) / (self._stamps[after] - before)
+        (x0, y0), (x1, y1) = self._places[after - 1], self._places[after]
+        return x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+
+
 class SilenceWatch:
     """Whether the sensors see something move (room.md row 11): a single echo may be noise, a share of them is not."""
 
@@ -194,6 +240,35 @@ class SilenceWatch:
         if stamp_ns - self._echoes[-1][0] > self._memory_ns:
             return False
         return self._valid > self.LEAST_SHARE * len(self._echoes)
+
+
+class MotionWatch:
+    """Whether the person moves: not if an IMU feels no steps, and not if the sensors see nothing move.
+
+    Who stands and who is out of range look the same to the sensors (room.md row 11), and they tell late.
+    """
+
+    def __init__(self, memory: float, timeout: float) -> None:
+        self._silence = SilenceWatch(memory)
+        self._timeout_ns = round(timeout * 1e9)
+        self._standing = False
+        self._felt_ns = 0
+
+    def echo(self, stamp_ns: int, valid: bool) -> None:
+        """Take whether a sensor sees something move."""
+        self._silence.update(stamp_ns, valid)
+
+    def steps(self, stamp_ns: int, standing: bool | None) -> None:
+        """Take whether the IMU feels its wearer stand; None: it cannot tell."""
+        self._standing, self._felt_ns = standing is True, stamp_ns
+
+    def standing(self, stamp_ns: int) -> bool:
+        """Whether the person is felt to stand."""
+        return self._standing and stamp_ns - self._felt_ns < self._timeout_ns
+
+    def moving(self, stamp_ns: int) -> bool:
+        """Whether the position changes, as far as anybody can tell."""
+        return not self.standing(stamp_ns) and self._silence.moving(stamp_ns)
 
 
 def pattern_loss(azimuth_off: float) -> float:

@@ -1,18 +1,22 @@
 """Every message that crosses a process, and its encoding: the contract of docs/messages.md."""
 
-from caneflow.messages.codec import MAX_PAYLOAD, MEDIA_TYPE, decode, encode, json_schema, numbered, with_number
-from caneflow.messages.errors import MessageError
-from caneflow.messages.keys import NAME, NAME_RULE, control_key, sample_key, stream_of
-from caneflow.messages.samples import (
-    SAMPLES,
-    DopplerBlock,
-    DopplerTarget,
-    GroundSpeed,
-    Imu,
-    Pose,
-    RadarFrame,
-    Sample,
-)
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from caneflow.messages.codec import MAX_PAYLOAD, MEDIA_TYPE, decode, encode, json_schema, numbered, with_number
+    from caneflow.messages.errors import MessageError
+    from caneflow.messages.keys import NAME, NAME_RULE, control_key, sample_key, stream_of
+    from caneflow.messages.samples import (
+        SAMPLES,
+        DopplerBlock,
+        DopplerTarget,
+        GroundSpeed,
+        Imu,
+        Pose,
+        RadarFrame,
+        Sample,
+    )
 
 __all__ = [
     "MAX_PAYLOAD",
@@ -37,3 +41,17 @@ __all__ = [
     "stream_of",
     "with_number",
 ]
+
+LIGHT = {  # where what needs no numpy is, which takes as long to import as all the rest of `caneflow status`
+    "MessageError": "errors",
+    **dict.fromkeys(("NAME", "NAME_RULE", "control_key", "sample_key", "stream_of"), "keys"),
+}
+CODEC = ("MAX_PAYLOAD", "MEDIA_TYPE", "decode", "encode", "json_schema", "numbered", "with_number")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    room = LIGHT.get(name, "codec" if name in CODEC else "samples")
+    value = globals()[name] = getattr(import_module(f"{__name__}.{room}"), name)
+    return value

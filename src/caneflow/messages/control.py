@@ -57,6 +57,16 @@ class InputCounts(msgspec.Struct, kw_only=True, gc=False):
     waiting: int = 0
 
 
+class Delays(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """How long the last samples of one input took, in s; None: nothing to tell it by."""
+
+    latency_p50: float | None = None  # from the writer's put to the reader's hand, on both machines' clocks
+    latency_p99: float | None = None
+    age_p50: float | None = None  # live: from the measurement (its stamp) to the reader's hand
+    age_p99: float | None = None
+    silent: float | None = None  # since the last one came
+
+
 class Counters(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """`@/counters/<node>`: once a second and at the end."""
 
@@ -64,3 +74,73 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     inputs: dict[str, InputCounts]
     outputs: dict[str, int]  # samples sent
     refused: int = 0  # what a source brought and that could not be sent
+    unsent: dict[str, int] = {}  # the same by output port
+    delays: dict[str, Delays] = {}  # by input port; from processes only
+
+
+class Clock(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """`@/clock/<here>/<there>`: how far the clock of another machine is from this one's."""
+
+    here: str  # the machine that says it
+    there: str
+    at: int  # ns, this machine's clock: when `offset` held
+    offset: float  # s, their clock less this one's
+    drift: float  # s/s, positive when theirs is faster
+    uncertainty: float  # s, of the offset
+    delay: float  # s, the shortest round trip of late
+    steps: int = 0  # how often one of the two was set
+
+
+class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One node of a running flow, as its launcher knows it."""
+
+    node: str
+    program: str
+    state: str  # starting, ready, waiting (for its restart), failed
+    pid: int
+    restarts: int
+    uptime: float  # s since its process was started
+    cpu: float | None  # of one core, over the last second or so; 1.0 is a whole one
+    memory: int | None  # bytes, resident
+    sent: dict[str, int]  # by output port
+    rates: dict[str, float | None]  # Hz, by output port
+    counted: float | None  # s since it last said its counters; None: never yet
+    said: str  # the last line that it wrote
+    listen: tuple[str, ...] = ()  # Zenoh endpoints
+    machine: str = ""  # its name in the file; "" when the flow has only one
+    connect: tuple[str, ...] = ()  # whom it dials: its launcher, and the writers of its inputs
+
+
+class EdgeStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One wire of a running flow, as its reader counts it. Losses are by place: where to look."""
+
+    writer: str  # node/port
+    reader: str  # node.port
+    schema: str
+    sent: int
+    received: int
+    handled: int
+    waiting: int  # in the queue
+    rate: float | None  # Hz, received
+    sender: int  # lost there: what a source brought and that could not be sent
+    wire: int  # lost there: numbers that never came
+    decode: int  # lost there: broke the contract, or the program refused it
+    queue: int  # lost there: fell out of a full queue, or was too old (max_age_ms)
+    late: int  # lost there: the graph had gone on without it (max_lag_ms)
+    repeated: int  # came twice; no loss
+    delays: Delays
+
+
+class FlowStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to a query on `@/status`: what one launcher knows of its nodes."""
+
+    flow: str
+    version: str  # of caneflow
+    host: str  # the machine's own name
+    pid: int  # of the launcher
+    uptime: float  # s
+    replay: bool
+    clock: int  # ns, Unix epoch: when it answered, on its machine's clock
+    machine: str  # its name in the file; "" when the flow has only one
+    nodes: list[NodeStatus]
+    edges: list[EdgeStatus]

@@ -1,13 +1,15 @@
 """From a checked graph to one plan per node: live drivers or a recording in their place, a recorder, the links."""
 
+import hashlib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import msgspec
 
+import caneflow
 from caneflow.messages import Sample, control_key, decode, sample_key
 from caneflow.messages.control import LeftOut
 from caneflow.messages.rig import overlaid, read_rig
@@ -16,6 +18,7 @@ from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links import Ports
 from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
+from caneflow.runtime.wording import did_you_mean, listed
 
 LeftOutStamps: TypeAlias = dict[tuple[str, str], set[int]]
 
@@ -38,23 +41,79 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Site:
+    """The machine that a launcher runs on, among those of its flow."""
+
+    name: str
+    leader: str  # the machine whose launcher says when all start and end
+    others: tuple[str, ...]
+    places: Mapping[str, str]  # by node the machine that it runs on
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    recorders: frozenset[str] = frozenset()  # the machines that may read every stream
+    insecure: bool = False  # the file says that machines talk in the clear
+
+    @property
+    def leads(self) -> bool:
+        """Whether this machine's launcher leads."""
+        return self.name == self.leader
+
+
+@dataclass(frozen=True, kw_only=True)
 class Deployment:
     """Everything that a host needs to run a flow."""
 
     flow: str
     plans: dict[str, NodePlan]
     origin: int = 0  # ns: the stamp at which a replay begins
+    site: Site | None = None  # when the flow runs on several machines
 
     @property
     def replay(self) -> bool:
         """Whether the sources are recordings."""
         return any(plan.replay for plan in self.plans.values())
 
+    def runs_here(self, node: str) -> bool:
+        """Whether this launcher starts `node`."""
+        return self.site is None or self.site.places[node] == self.site.name
+
+    @property
+    def records(self) -> bool:
+        """Whether a recorder runs here."""
+        return any(plan.module == RECORDER_MODULE and self.runs_here(name) for name, plan in self.plans.items())
+
+    @property
+    def digest(self) -> str:
+        """What every machine of a run must agree on, in short: the wires, and what is replayed from where."""
+        agreed = {
+            name: (
+                *sorted((port, wire.key, wire.schema, wire.left_out) for port, wire in plan.inputs.items()),
+                *sorted((out.key, out.schema) for out in plan.outputs.values()),
+                {key: value for key, value in plan.settings.items() if key != "recording"}
+                if plan.module == REPLAYER_MODULE
+                else None,
+                (plan.rig, plan.seed, plan.replay, self.site.places[name] if self.site else None),
+            )
+            for name, plan in sorted(self.plans.items())
+            if plan.module != RECORDER_MODULE
+        }
+        return hashlib.sha256(msgspec.json.encode((caneflow.__version__, agreed), order="sorted")).hexdigest()[:16]
+
 
 def deploy(
-    graph: Graph, *, replay: Replay | None = None, record: Path | None = None, rig: dict[str, Any] | None = None
+    graph: Graph,
+    *,
+    replay: Replay | None = None,
+    record: Path | None = None,
+    recorder: Mapping[str, Any] | None = None,
+    rig: dict[str, Any] | None = None,
+    machine: str | None = None,
 ) -> Deployment:
-    """The plans of one run; raises DataflowError when the recording does not fit the graph."""
+    """The plans of one run; raises DataflowError when the recording does not fit the graph.
+
+    `recorder`: its settings beyond where it writes. `machine`: this launcher starts only what runs there; None:
+    everything.
+    """
     if replay and record and record.exists() and record.samefile(replay.recording):
         raise DataflowError(f"--record {record}: is the recording that is replayed; write to another file")
     without = replay.without if replay else frozenset()
@@ -77,22 +136,92 @@ def deploy(
             }
     whole_rig = overlaid(base_rig, rig or {})
     read_rig(whole_rig)  # what is wrong with a recording's rig is said before anything starts
+    site = None if machine is None else _site(graph, machine, nodes)
     if record is not None:
-        plans[RECORDER] = _recorder(graph, plans, record, replay, whole_rig)
+        name = recorder_name(machine if site else None)
+        if site and (unheard := set(site.places.values()) - {site.name, *site.others}):
+            raise DataflowError(f"--record: {machine} has no link with {min(unheard)}; record on {site.leader}")
+        plan = _recorder(graph, name, plans, record, replay, whole_rig)
+        plans[name] = msgspec.structs.replace(plan, settings={**plan.settings, **(recorder or {})})
+        site = _with_recorder_on(site, machine) if site and machine else site
     plans = {name: _with_readers(plan, plans, whole_rig, replay is not None) for name, plan in plans.items()}
-    return Deployment(flow=graph.flow, plans=plans, origin=origin)
+    return Deployment(flow=graph.flow, plans=plans, origin=origin, site=site)
+
+
+def with_recorders_on(deployment: Deployment, machines: Iterable[str]) -> Deployment:
+    """The same with the recorders of other machines, so that writers here know of these readers."""
+    plans, site = dict(deployment.plans), deployment.site
+    for machine in machines:
+        name = recorder_name(machine)
+        inputs = _all_outputs(plans)
+        plans[name] = NodePlan(
+            flow=deployment.flow, node=name, module=RECORDER_MODULE, inputs=inputs, replay=deployment.replay
+        )
+        site = _with_recorder_on(site, machine) if site else site
+    plans = {name: _with_readers(plan, plans, plan.rig, plan.replay) for name, plan in plans.items()}
+    return replace(deployment, plans=plans, site=site)
 
 
 def linked(deployment: Deployment, ports: Ports, launcher: str) -> Deployment:
-    """The same with an endpoint for every writer: readers dial writers, everybody dials the launcher."""
-    endpoints = {name: ports.endpoint() for name, plan in deployment.plans.items() if plan.readers}
-    plans = {}
-    for name, plan in deployment.plans.items():
+    """The same with an endpoint for every writer here: readers dial writers, everybody dials the launcher."""
+    here = {name: plan for name, plan in deployment.plans.items() if deployment.runs_here(name)}
+    endpoints = {name: ports.endpoint() for name, plan in here.items() if any(map(here.get, plan.readers))}
+    plans = dict(deployment.plans)
+    for name, plan in here.items():
         writers = dict.fromkeys(wire.writer for wire in plan.inputs.values())
         connect = (launcher, *(endpoints[writer] for writer in writers if writer in endpoints))
         listen = (endpoints[name],) if name in endpoints else ()
-        plans[name] = msgspec.structs.replace(plan, links=Links(listen=listen, connect=connect))
-    return Deployment(flow=deployment.flow, plans=plans, origin=deployment.origin)
+        plan = msgspec.structs.replace(plan, links=Links(listen=listen, connect=connect))
+        plans[name] = _with_clocks(plan, deployment.site) if deployment.site else plan
+    return replace(deployment, plans=plans)
+
+
+def _with_clocks(plan: NodePlan, site: Site) -> NodePlan:
+    """The plan with the machine on whose clock each input is."""
+    inputs = {
+        port: msgspec.structs.replace(
+            wire, clock="" if site.places[wire.writer] == site.name else site.places[wire.writer]
+        )
+        for port, wire in plan.inputs.items()
+    }
+    return msgspec.structs.replace(plan, inputs=inputs, machine=site.name)
+
+
+def _site(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | None:
+    """The place of `machine` in the graph; None when it is the only one."""
+    if machine not in graph.machines:
+        raise DataflowError(
+            f"--machine {machine}: no such machine;{did_you_mean(machine, graph.machines)} "
+            f"there are {listed(graph.machines)}"
+        )
+    places = {name: str(node.machine) for name, node in nodes.items()}
+    used = [name for name in graph.machines if name in places.values()]
+    if machine not in used:
+        raise DataflowError(f"--machine {machine}: no node runs there")
+    if len(used) == 1:
+        return None
+    leader = graph.leader if graph.leader in used else used[0]
+    assert leader is not None
+    written = graph.machines[machine]
+    return Site(
+        name=machine,
+        leader=leader,
+        others=tuple(name for name in used if name in written.linked),
+        places=places,
+        listen=written.listen,
+        connect=written.connect,
+        recorders=frozenset(name for name in used if graph.machines[name].records),
+        insecure=graph.insecure,
+    )
+
+
+def recorder_name(machine: str | None) -> str:
+    """What a recorder is called: there may be one on each machine."""
+    return RECORDER if machine is None else f"{RECORDER}_{machine}"
+
+
+def _with_recorder_on(site: Site, machine: str) -> Site:
+    return replace(site, places={**site.places, recorder_name(machine): machine})
 
 
 def _plan(graph: Graph, node: Node, nodes: dict[str, Node], left_out: LeftOutStamps | None = None) -> NodePlan:
@@ -214,16 +343,20 @@ def _loop_s(recording: Recording, replay: Replay, origin: int) -> float:
     return whole if replay.duration_s is None else min(whole, replay.duration_s)
 
 
-def _recorder(
-    graph: Graph, plans: dict[str, NodePlan], record: Path, replay: Replay | None, rig: dict[str, Any]
-) -> NodePlan:
-    if RECORDER in plans:
-        raise DataflowError(f"{graph.path}: nodes.{RECORDER}: --record adds a node of that name; call yours otherwise")
-    inputs = {
+def _all_outputs(plans: Mapping[str, NodePlan]) -> dict[str, InputPlan]:
+    """What a recorder reads."""
+    return {
         f"{plan.node}/{port}": InputPlan(key=out.key, schema=out.schema, writer=plan.node)
         for plan in plans.values()
         for port, out in plan.outputs.items()
     }
+
+
+def _recorder(
+    graph: Graph, name: str, plans: dict[str, NodePlan], record: Path, replay: Replay | None, rig: dict[str, Any]
+) -> NodePlan:
+    if name in plans:
+        raise DataflowError(f"{graph.path}: nodes.{name}: --record adds a node of that name; call yours otherwise")
     carries_truth = replay is not None and not replay.loop and TRUTH[0] not in plans
     settings = {
         "path": str(record.resolve()),
@@ -234,10 +367,10 @@ def _recorder(
     }
     return NodePlan(
         flow=graph.flow,
-        node=RECORDER,
+        node=name,
         module=RECORDER_MODULE,
         settings=settings,
-        inputs=inputs,
+        inputs=_all_outputs(plans),
         hears_notes=replay is None,
     )
 

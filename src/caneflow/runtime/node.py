@@ -18,7 +18,7 @@ import msgspec
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import MessageError, Sample, decode, numbered
-from caneflow.messages.control import Again, Counters, Progress
+from caneflow.messages.control import Again, Clock, Counters, Progress
 from caneflow.messages.rig import read_rig
 from caneflow.runtime.dataflow.programs import validated_settings
 from caneflow.runtime.hosts.bus import (
@@ -31,10 +31,13 @@ from caneflow.runtime.hosts.bus import (
     Marked,
     Noted,
     Opened,
+    Questioned,
     Started,
     Stopped,
+    Timed,
     check_schema,
 )
+from caneflow.runtime.hosts.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.stages.feed import Feed
@@ -49,6 +52,7 @@ log = logging.getLogger(__name__)
 
 REPORT_PERIOD = 0.02  # s between two progress marks under load
 COUNTERS_PERIOD = 1.0  # s
+SAY_AGAIN_PERIOD = 1.0  # s after which a progress mark is said again: the last one may have met a broken link
 ASK_PERIOD = 0.3  # s between two requests for samples that have not come
 LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run
 REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
@@ -60,7 +64,9 @@ def run(program: Program) -> None:
     logging.basicConfig(format="%(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
     try:
         path = Path(sys.argv[1])
-        sys.exit(_run(program, NodePlan.read(path), path.with_suffix(".snapshot")))
+        plan = NodePlan.read(path)
+        folder = path.parent if plan.state_folder is None else Path(plan.state_folder)
+        sys.exit(_run(program, plan, folder / f"{plan.node}.snapshot"))
     except IndexError:
         sys.exit(f"usage: {sys.argv[0]} PLAN; a node is started by `caneflow run`")
     except CaneflowError as error:
@@ -100,19 +106,25 @@ class _Reports:
         self._period = period
         self.said: Progress | None = None
         self._next_progress = 0.0
+        self._say_again = 0.0
         self._next_counters = time.monotonic() + COUNTERS_PERIOD
 
     def due(self) -> bool:
         return time.monotonic() >= self._next_progress
 
     def progress(self, progress: Progress) -> None:
-        if progress != self.said:
+        now = time.monotonic()
+        if progress != self.said or now >= self._say_again:
             self._bus.send_progress(progress)
             self.said = progress
-        self._next_progress = time.monotonic() + self._period
+            self._say_again = now + SAY_AGAIN_PERIOD
+        self._next_progress = now + self._period
+
+    def counters_due(self) -> bool:
+        return time.monotonic() >= self._next_counters
 
     def counters(self, counters: Counters, *, at_once: bool = False) -> None:
-        if at_once or time.monotonic() >= self._next_counters:
+        if at_once or self.counters_due():
             self._bus.send_counters(counters)
             self._next_counters = time.monotonic() + COUNTERS_PERIOD
 
@@ -134,9 +146,14 @@ class _ReaderNode(ABC):
         self.reader = reader
         self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else 5 * REPORT_PERIOD)
         self.stopped = False
+        self._delays = {port: RecentDelays(live=not plan.replay) for port in plan.inputs}
         self._missing: dict[str, _Missing] = {}
-        for arrivals in reader.inputs.values():
+        # Each writer is asked at the start what it has sent so far, until it answers: a node that is started anew may
+        # have missed its last word, and the link to the writer may not be there yet.
+        self._unanswered = dict.fromkeys(plan.inputs, 0.0)  # s, monotonic: when to ask next
+        for port, arrivals in reader.inputs.items():
             arrivals.patient = True
+            arrivals.clock_offset = None if plan.inputs[port].clock else 0
 
     def take_events(self, timeout: float) -> bool:
         """Take what came, waiting up to `timeout` s for it; whether anything came."""
@@ -151,6 +168,7 @@ class _ReaderNode(ABC):
             case Arrived():
                 self.take_sample(event)
             case Answered():
+                self._unanswered.pop(event.port, None)
                 self.reader.mark(event.port, event.mark)
                 if event.first > self.reader.inputs[event.port].expected:
                     self.skip_to(event.port, event.first)  # the writer does not have what lies before it any more
@@ -158,10 +176,19 @@ class _ReaderNode(ABC):
                 self.reader.mark(event.port, event.mark)
             case Noted() if isinstance(self.reader, Tap):
                 self.reader.note(event.key, event.payload, time.time_ns())
+            case Timed():
+                self.set_clock(event.clock)
             case Stopped():
                 self.stopped = True
             case _:
                 pass  # for sources
+
+    def set_clock(self, clock: Clock) -> None:
+        """Take note of how far a writer's clock is from this machine's."""
+        now = clock.offset + clock.drift * (time.time_ns() - clock.at) / 1e9
+        for port, wire in self.plan.inputs.items():
+            if wire.clock == clock.there:
+                self.reader.inputs[port].clock_offset = round(now * 1e9)
 
     def take_sample(self, arrived: Arrived) -> None:
         wire = self.plan.inputs[arrived.port]
@@ -171,6 +198,12 @@ class _ReaderNode(ABC):
         except MessageError as error:
             self.reader.refuse(arrived.port, error)
             return
+        offset = self.reader.inputs[arrived.port].clock_offset
+        if not (self.plan.replay or arrived.again):
+            self._unanswered.pop(arrived.port, None)  # live: what is missing before it shows by its number
+        if offset is not None and (arrived.sent_at or not (self.plan.replay or arrived.again)):
+            sent_at = arrived.sent_at and arrived.sent_at - offset
+            self._delays[arrived.port].note(time.time_ns(), sent_at, message.stamp - offset)
         self.take_message(arrived, message)
 
     @abstractmethod
@@ -180,6 +213,10 @@ class _ReaderNode(ABC):
     def ask_for_missing(self) -> None:
         """Ask for samples that were sent and have not come; after long enough, go on without them."""
         now = time.monotonic()
+        for port, ask_at in self._unanswered.items():
+            if now >= ask_at:
+                self.bus.ask_again(port, self.reader.inputs[port].expected)
+                self._unanswered[port] = now + ASK_PERIOD
         for port, arrivals in self.reader.inputs.items():
             before = arrivals.missing_before
             if before is None:
@@ -197,7 +234,12 @@ class _ReaderNode(ABC):
         """Go on without the samples before `seq`."""
 
     def count(self, outputs: dict[str, int], *, at_once: bool = False) -> None:
-        counters = Counters(node=self.plan.node, inputs=self.reader.input_counts(), outputs=outputs)
+        if not (at_once or self.reports.counters_due()):
+            return
+        now = time.time_ns()
+        delays = {port: each.spread(now) for port, each in self._delays.items()}
+        counts = self.reader.input_counts()
+        counters = Counters(node=self.plan.node, inputs=counts, outputs=outputs, delays=delays)
         self.reports.counters(counters, at_once=at_once)
 
 
@@ -287,12 +329,10 @@ class _OperatorNode(_ReaderNode):
         return True
 
     def send_again(self) -> None:
-        """Send what readers may not have got before the kill, and ask for what came since the snapshot."""
+        """Send what readers may not have got before the kill; what came since the snapshot is asked for."""
         for port, samples in self.history.kept().items():
             for kept in samples:
                 self.bus.send(port, kept.payload)
-        for port, arrivals in self.stage.inputs.items():
-            self.bus.ask_again(port, arrivals.expected)
 
     def wait_no_longer_than_allowed(self) -> None:
         """Live: go on without an input that holds up what came longer than its max_lag_ms ago."""
@@ -342,6 +382,12 @@ class _SinkNode(_ReaderNode):
         finally:
             self.tap.finish()
         self.count({}, at_once=True)
+
+    def take(self, event: Event) -> None:
+        if isinstance(event, Questioned):
+            self.bus.answer_question(event, self.tap.asked(event.question, time.time_ns()))
+        else:
+            super().take(event)
 
     def take_message(self, arrived: Arrived, message: Sample) -> None:
         self.tap.offer(arrived.port, message, arrived.payload, time.time_ns(), again=arrived.again)
@@ -407,7 +453,7 @@ class _SourceNode:
         while stamp > self.until and not self.stopped:
             self.feed.nothing_until(stamp - 1)
             self.reports.progress(self.feed.progress())
-            self.take_events(timeout=None)
+            self.take_events(timeout=SAY_AGAIN_PERIOD)
 
     def take_events(self, timeout: float | None) -> None:
         for event in self.bus.events(timeout):
@@ -428,9 +474,9 @@ class _SourceNode:
         """Say that nothing more will come, and stay until the launcher ends the flow."""
         self.feed.ended = True
         self.count(at_once=True)
-        self.reports.progress(self.feed.progress())
         while not self.stopped:
-            self.take_events(timeout=None)
+            self.reports.progress(self.feed.progress())
+            self.take_events(timeout=SAY_AGAIN_PERIOD)
 
     @contextmanager
     def ended_by_sigterm(self) -> Iterator[None]:
@@ -449,5 +495,8 @@ class _SourceNode:
 
     def count(self, *, at_once: bool = False) -> None:
         sent = {port: out.sent for port, out in self.feed.outputs.items()}
-        counters = Counters(node=self.plan.node, inputs={}, outputs=sent, refused=self.feed.refused)
+        unsent = self.feed.unsent
+        counters = Counters(
+            node=self.plan.node, inputs={}, outputs=sent, refused=self.feed.refused, unsent=dict(unsent)
+        )
         self.reports.counters(counters, at_once=at_once)

@@ -16,6 +16,7 @@ class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     key: str
     schema: str  # of the port's type, e.g. "caneflow.Imu/1"
     writer: str  # the node at the other end
+    clock: str = ""  # the machine whose clock its stamps are on, when that is not this one
     length: int | None = None  # how many samples may wait; the oldest is dropped beyond. None: all
     max_lag_ms: float | None = None  # live: how long the graph waits for this input. None: for ever
     max_age_ms: float | None = None  # live: older samples are dropped. None: never
@@ -67,6 +68,9 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
     outputs: dict[str, OutputPlan] = {}
     hears_notes: bool = False  # a recorder also takes what nodes say they left out
     links: Links = Links()
+    machine: str = ""  # that the node runs on, when there are several
+    absent: tuple[str, ...] = ()  # readers on machines that are not there: the node does not wait for them
+    state_folder: str | None = None  # where snapshots are kept; None: beside the plan
     ready_timeout_s: float = 20.0
 
     @property

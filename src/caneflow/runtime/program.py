@@ -112,6 +112,10 @@ class Sink(ABC):
     def note(self, key: str, payload: bytes, time: int) -> None:  # noqa: B027 - most sinks have no use for it
         """Take what a node says that it left out (`@/late`), at `time` (ns); only a recorder is told."""
 
+    def asked(self, question: bytes, time: int) -> bytes | None:
+        """The answer to a tool's question (`@/ask/<node>`), at `time` (ns); None: it is none for this sink."""
+        return None
+
     @abstractmethod
     def idle(self, time: int) -> None:
         """Called when nothing has come for a while, with the time (ns)."""

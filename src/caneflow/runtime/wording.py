@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 from typing import TypeAlias
 
@@ -31,6 +31,16 @@ def one_line(text: object) -> str:
 def listed(names: Iterable[str]) -> str:
     """`names` as a list to read, or the word for none."""
     return ", ".join(names) or "none"
+
+
+def in_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:
+    """`rows` as lines with aligned columns, those of the numbers in `right` to the right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = (f"{cell:{'>' if i in right else '<'}{widths[i]}}" for i, cell in enumerate(row))
+        lines.append("  ".join(cells).rstrip())
+    return lines
 
 
 def did_you_mean(word: str, names: Iterable[str], *, likeness: float = 0.6) -> str:

@@ -4,7 +4,8 @@ An installation (its seed: mounting, modules, walls, magnetic field) and a perso
 a set of recordings: the empty room, a calibration walk along either axis, and the course.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple, TypeAlias, get_args
@@ -170,6 +171,22 @@ def simulate_room(
     sensors leave everything else as it was. `progress` is told the part done, 0..1.
     Raises ValueError for a part that is not there or a negative seed.
     """
+    return simulate_kinds(settings, part, seed, (settings.modules,), person_seed, progress)[settings.modules]
+
+
+def simulate_kinds(
+    settings: RoomSettings,
+    part: Part,
+    seed: int,
+    kinds: Sequence[Kind],
+    person_seed: int | None = None,
+    progress: Callable[[float], None] | None = None,
+    way: Trajectory | None = None,
+) -> Mapping[Kind, RoomRecording]:
+    """The same walk as modules of several kinds hear it, each as by `simulate_room`, in the time of one.
+
+    `way` is walked instead of the one that settings and seeds would make; whole blocks long.
+    """
     person_seed = seed if person_seed is None else person_seed
     if part not in PARTS:
         raise ValueError(f"no part {part!r}; there are {', '.join(PARTS)}")
@@ -182,14 +199,18 @@ def simulate_room(
     way_rng, gait_rng, imu_rng, start_rng, *sensor_rngs = _generators(
         (_RECORDING, seed, person_seed, _number(settings, part)), 4 + len(SENSORS)
     )
-    walk = gait(_way(settings, part, way_rng), who, settings.person, gait_rng)
+    way = way or _way(settings, part, way_rng)
+    walk = gait(way, who, settings.person, gait_rng)
     sampled = measure(walk, belt(settings.imu, belt_rng), settings.imu, imu_rng, default_rng(place.field))
-    blocks = {}
+    heard: dict[Kind, dict[str, NDArray[np.int16] | Complexes]] = {kind: {} for kind in kinds}
     for i, name in enumerate(place.mountings):
         echoes = _echoes(settings, part, walk, who, place, name, sensor_rngs[i], _share(progress, i, settings.sensors))
-        heard = receive(echoes, place.modules[name], settings.modules, settings.module, sensor_rngs[i])
-        blocks[name] = heard.reshape(-1, settings.module.sample_rate * BLOCK_NS // 1_000_000_000)
-    return _recording(settings, walk.trajectory, sampled, blocks, _rig(settings, part, place, walk, start_rng))
+        for kind in kinds:
+            rng = deepcopy(sensor_rngs[i])  # every kind hears the noise that it would hear alone
+            samples = receive(echoes, place.modules[name], kind, settings.module, rng)
+            heard[kind][name] = samples.reshape(-1, settings.module.sample_rate * BLOCK_NS // 1_000_000_000)
+    rig = _rig(settings, part, place, walk, start_rng)
+    return {kind: _recording(settings, walk.trajectory, sampled, blocks, rig) for kind, blocks in heard.items()}
 
 
 class _Installation(NamedTuple):

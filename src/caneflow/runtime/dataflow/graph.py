@@ -50,6 +50,8 @@ class Machine:
 
     listen: tuple[str, ...]
     connect: tuple[str, ...]
+    linked: tuple[str, ...] = ()  # the machines that it has a link with
+    records: bool = False  # it may read every stream
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +84,8 @@ class Graph:
     nodes: dict[str, Node]  # in the order of the file
     results: tuple[str, ...]  # outputs, `node/port`, that are for people and recordings
     path: Path
+    insecure: bool = False  # machines talk in the clear, with whoever reaches them
+    leader: str | None = None  # the machine whose launcher starts and ends the others; None: there is only one
     warnings: tuple[str, ...] = field(default=())
 
     def order(self) -> tuple[str, ...]:

@@ -74,8 +74,8 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
         document.problem(("nodes",), "there are none; a flow has at least one node")
     parts = {name: _part(document, name, shape, path.parent) for name, shape in flow.nodes.items()}
     check_wires(document, flow, parts)
-    machines = check_machines(document, flow, parts)
-    nodes = {name: _node(document, name, part, machines[name]) for name, part in parts.items()}
+    layout = check_machines(document, flow, parts)
+    nodes = {name: _node(document, name, part, layout.places[name]) for name, part in parts.items()}
     if any(not problem.warning for problem in document.problems):
         document.problems = [problem for problem in document.problems if not problem.warning]
         return None
@@ -85,12 +85,19 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
         seed=flow.seed,
         rig=document.value.get("rig", {}),
         machines={
-            name: Machine(listen=tuple(machine.listen), connect=tuple(machine.connect))
+            name: Machine(
+                listen=tuple(machine.listen),
+                connect=tuple(machine.connect),
+                linked=layout.links[name],
+                records=machine.records,
+            )
             for name, machine in flow.machines.items()
         },
         nodes=nodes,
         results=tuple(flow.results),
         path=path,
+        insecure=flow.insecure,
+        leader=layout.leader,
         warnings=tuple(map(str, _sorted(document))),
     )
 

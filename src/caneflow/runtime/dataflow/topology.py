@@ -5,7 +5,7 @@ own, which exactly one of the two dials.
 """
 
 import ipaddress
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from caneflow.runtime.dataflow.wiring import Part
@@ -15,6 +15,15 @@ from caneflow.runtime.wording import did_you_mean, listed
 
 EVERYWHERE = {"0.0.0.0", "[::]"}  # noqa: S104 - compared with, not bound to
 HIGHEST_PORT = 65535
+RESERVED = {"ca", "observer"}  # names among the keys of a flow
+
+
+class Layout(NamedTuple):
+    """Where everything runs."""
+
+    places: dict[str, str | None]  # the machine of every node; None: there is only one, without a name
+    leader: str | None  # the first machine of the file that has a link with every other one
+    links: dict[str, tuple[str, ...]]  # by machine those that it has a link with
 
 
 class Endpoint(NamedTuple):
@@ -25,25 +34,53 @@ class Endpoint(NamedTuple):
     port: int
 
 
-def check_machines(document: Document, flow: FlowShape, parts: Mapping[str, Part]) -> dict[str, str | None]:
-    """The machine of every node (None: there is only one, without a name); what is wrong is noted."""
+def check_machines(document: Document, flow: FlowShape, parts: Mapping[str, Part]) -> Layout:
+    """The machine of every node, and the one that leads; what is wrong is noted."""
     places = {name: _machine_of(document, flow, name, part) for name, part in parts.items()}
     reached = _reached(document, flow)
+    dead = False
     for reader, part in parts.items():
         for port, wire in part.wires.items():
             here, there = places[reader], places.get(wire.node)
             if here is None or there is None or here == there:
                 continue
             if there not in reached[here] and here not in reached[there]:
+                dead = True
                 document.problem(
                     ("nodes", reader, "inputs", port),
                     f"leads from machine {there!r} to machine {here!r}, and neither dials the other; "
                     f"{_advice(flow, there, here)} (a third machine does not relay)",
                 )
     for machine in flow.machines:
+        if machine in RESERVED:
+            document.problem(("machines", machine), "is taken by caneflow; call it otherwise", key=True)
         if machine not in places.values():
             document.problem(("machines", machine), "no node runs here", key=True, warning=True)
-    return places
+    used = [machine for machine in flow.machines if machine in places.values()]
+    leader = _leader(used, reached)
+    if len(used) > 1 and leader is None and not dead:
+        document.problem(
+            ("machines",),
+            f"none of {listed(used)} has a link with every other one, so none can lead: "
+            f"the others hear from it when to start; {_advice(flow, used[0], used[1])}",
+        )
+    links = {
+        name: tuple(other for other in flow.machines if other in reached[name] or name in reached[other])
+        for name in flow.machines
+    }
+    if flow.insecure:
+        document.problem(
+            ("insecure",), "machines talk in the clear: whoever reaches them reads and writes everything", warning=True
+        )
+    return Layout(places, leader if len(used) > 1 else None, links)
+
+
+def _leader(machines: Sequence[str], reached: Mapping[str, set[str]]) -> str | None:
+    """The first machine that has a link with every other one."""
+    for machine in machines:
+        if all(other in reached[machine] or machine in reached[other] for other in machines if other != machine):
+            return machine
+    return None
 
 
 def _machine_of(document: Document, flow: FlowShape, name: str, part: Part) -> str | None:
@@ -122,6 +159,11 @@ def _is_address(host: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_open(endpoint: str) -> bool:
+    """Whether `endpoint` leads beyond this computer."""
+    return not _is_loopback(_parts(endpoint).host)
 
 
 def _is_loopback(host: str) -> bool:

@@ -82,6 +82,9 @@ class MachineShape(Shape):
     connect: Annotated[
         list[Endpoint], Field(description="whom it dials: for each pair of machines, one of the two does")
     ] = []
+    records: Annotated[
+        bool, Field(description="may read every stream, to record them (`--record`); with keys it has to be said")
+    ] = False
 
 
 def _expanded_input(written: object) -> object:
@@ -162,6 +165,9 @@ class FlowShape(Shape):
     seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="where all random numbers of the flow come from")] = 0
     rig: Annotated[Rig, Field(default_factory=Rig, description="what is bolted on")]
     machines: Annotated[dict[Name, MachineShape], Field(description="when the flow runs on several computers")] = {}
+    insecure: Annotated[
+        bool, Field(description="machines talk in the clear, with whoever reaches them; else with keys only")
+    ] = False
     nodes: Annotated[dict[Name, NodeShape], Field(default_factory=dict, description="the programs and their wires")]
     results: Annotated[
         list[Stream], Field(description="outputs that are for people and recordings: no node has to read them")

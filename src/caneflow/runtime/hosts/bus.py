@@ -15,9 +15,9 @@ import msgspec
 import zenoh
 
 from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, encode
-from caneflow.messages.control import Again, Counters, LeftOut, PortMark, Progress, Window
+from caneflow.messages.control import Again, Clock, Counters, LeftOut, PortMark, Progress, Window
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.links import open_session
+from caneflow.runtime.hosts.links import open_session, sending_now, sent_at
 from caneflow.runtime.plan import InputPlan, NodePlan
 
 log = logging.getLogger(__name__)
@@ -26,6 +26,7 @@ C = TypeVar("C", bound=msgspec.Struct)
 
 AGAIN = "caneflow.Again/1"
 ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
+TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
 POLL = 0.01  # s between two looks at a condition that Zenoh does not signal
 
 
@@ -36,6 +37,7 @@ class Arrived(msgspec.Struct, frozen=True, gc=False):
     payload: bytes
     schema: str  # "" when the writer did not say
     again: bool = False  # it was asked for
+    sent_at: int = 0  # ns: when the writer put it, as it says beside the sample; 0: it did not say
 
 
 class Marked(msgspec.Struct, frozen=True, gc=False):
@@ -61,6 +63,13 @@ class Asked(msgspec.Struct, frozen=True, gc=False):
     query: zenoh.Query
 
 
+class Questioned(msgspec.Struct, frozen=True, gc=False):
+    """A tool asks a sink something."""
+
+    question: bytes
+    query: zenoh.Query
+
+
 class Confirmed(msgspec.Struct, frozen=True, gc=False):
     """A reader will not ask for a sample or any before it."""
 
@@ -74,6 +83,12 @@ class Noted(msgspec.Struct, frozen=True, gc=False):
 
     key: str
     payload: bytes
+
+
+class Timed(msgspec.Struct, frozen=True, gc=False):
+    """The launcher's word on another machine's clock."""
+
+    clock: Clock
 
 
 class Started(msgspec.Struct, frozen=True, gc=False):
@@ -91,7 +106,9 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
 
 
 Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
-Event: TypeAlias = Arrived | Answered | Asked | Confirmed | Noted | Marked | Started | Opened | Stopped
+Event: TypeAlias = (
+    Arrived | Answered | Asked | Questioned | Confirmed | Noted | Marked | Timed | Started | Opened | Stopped
+)
 
 
 class Bus:
@@ -108,6 +125,7 @@ class Bus:
         self._progress = self._control_publisher("progress", plan.node)
         self._counters = self._control_publisher("counters", plan.node)
         self._late = self._control_publisher("late")
+        self._until_timed = 0  # samples to send before the next that says when it was sent
 
     def __enter__(self) -> "Bus":
         return self
@@ -122,7 +140,8 @@ class Bus:
     def declare_ready(self) -> None:
         """Tell the launcher that this node hears its inputs and is heard by its readers; waits for the latter."""
         for reader in self._plan.readers:
-            self._wait_for_reader(reader)
+            if reader not in self._plan.absent:
+                self._wait_for_reader(reader)
         key = control_key(self._plan.flow, "ready", self._plan.node)
         self._held.append(self._session.liveliness().declare_token(key))
 
@@ -162,9 +181,22 @@ class Bus:
                 query.reply(key, payload, encoding=encoding)
             query.reply(key, encode(end), encoding=zenoh.Encoding(MEDIA_TYPE).with_schema(AGAIN))
 
+    def answer_question(self, questioned: Questioned, answer: bytes | None) -> None:
+        """Send a sink's answer; without one, the tool is told that there is none."""
+        with questioned.query as query:
+            if answer is None:
+                query.reply_err(f"{self._plan.node} has no answer to this")
+            else:
+                query.reply(query.key_expr, answer)
+
     def send(self, port: str, payload: bytes) -> None:
         """Publish a sample's bytes on an output port."""
-        self._publishers[port].put(payload)
+        if self._until_timed:
+            self._until_timed -= 1
+            self._publishers[port].put(payload)
+        else:  # beside the sample, whose bytes are the recording's
+            self._until_timed = TIMED_IN_REPLAY - 1 if self._plan.replay else 0
+            self._publishers[port].put(payload, attachment=sending_now())
 
     def send_progress(self, progress: Progress) -> None:
         """Publish how far this node has come."""
@@ -196,8 +228,12 @@ class Bus:
         self._subscribe(control_key(plan.flow, "start"), lambda _: self._inbox.put(Started()))
         if plan.replay:
             self._subscribe(control_key(plan.flow, "window"), self._on_window)
+        for machine in {wire.clock for wire in plan.inputs.values()} - {""}:
+            self._subscribe(control_key(plan.flow, "clock", plan.machine, machine), self._on_clock)
         if plan.hears_notes:
             self._subscribe(control_key(plan.flow, "late"), self._on_note)
+        if plan.inputs and not plan.outputs:
+            self._answer_with(control_key(plan.flow, "ask", plan.node), self._on_question)
 
     def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
         # indirect=False: straight on Zenoh's receiving thread, which a put into the inbox does not hold up.
@@ -232,7 +268,8 @@ class Bus:
 
     def _on_sample(self, port: str) -> Callable[[zenoh.Sample], None]:
         def put(sample: zenoh.Sample) -> None:
-            self._inbox.put(Arrived(port, sample.payload.to_bytes(), str(sample.encoding).rpartition(";")[2]))
+            schema = str(sample.encoding).rpartition(";")[2]
+            self._inbox.put(Arrived(port, sample.payload.to_bytes(), schema, sent_at=sent_at(sample)))
 
         return put
 
@@ -273,8 +310,17 @@ class Bus:
 
         return put
 
+    def _on_question(self, query: zenoh.Query) -> None:
+        question = query.payload.to_bytes() if query.payload is not None else b""
+        self._inbox.put(Questioned(question, query))
+
     def _on_note(self, sample: zenoh.Sample) -> None:
         self._inbox.put(Noted(str(sample.key_expr), sample.payload.to_bytes()))
+
+    def _on_clock(self, sample: zenoh.Sample) -> None:
+        clock = _control(sample, Clock)
+        if clock:
+            self._inbox.put(Timed(clock))
 
     def _on_window(self, sample: zenoh.Sample) -> None:
         window = _control(sample, Window)

@@ -138,7 +138,7 @@ class InProcess:
         counters = {}
         for name, (feed, _) in self._feeds.items():
             sent = {port: out.sent for port, out in feed.outputs.items()}
-            counters[name] = Counters(node=name, inputs={}, outputs=sent, refused=feed.refused)
+            counters[name] = Counters(node=name, inputs={}, outputs=sent, refused=feed.refused, unsent=feed.unsent)
         for name, reader in self._readers.items():
             outputs = {} if isinstance(reader, Tap) else {port: out.sent for port, out in reader.outputs.items()}
             counters[name] = Counters(node=name, inputs=reader.input_counts(), outputs=outputs)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 import zenoh
@@ -14,10 +15,29 @@ import zenoh
 from caneflow.messages import MessageError, control_key, decode, encode
 from caneflow.messages.control import Counters, Progress, Window
 from caneflow.runtime.dataflow.graph import Restart
-from caneflow.runtime.deployment import REPLAYER_MODULE, Deployment, linked, program_arguments
+from caneflow.runtime.deployment import (
+    REPLAYER_MODULE,
+    Deployment,
+    linked,
+    program_arguments,
+    with_recorders_on,
+)
+from caneflow.runtime.hosts.clocks import Answer, Clocks
 from caneflow.runtime.hosts.links import Ports, open_session
+from caneflow.runtime.hosts.machines import (
+    LINK_SETTINGS,
+    Began,
+    Company,
+    Ended,
+    Failed,
+    Joined,
+    Left,
+    Word,
+)
+from caneflow.runtime.hosts.observations import Observations
 from caneflow.runtime.hosts.processes import Exited, Line, Processes
-from caneflow.runtime.hosts.run_directory import RunDirectory
+from caneflow.runtime.hosts.run_directory import RunDirectory, remove_state_folder, state_folder
+from caneflow.runtime.hosts.security import links_between
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.stages.merge import BEGIN, END
 
@@ -25,6 +45,9 @@ log = logging.getLogger(__name__)
 
 REPLAY_WINDOW = 5_000_000_000  # ns of event time that the sources of a replay may be ahead of the slowest reader
 STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them: 5 s in all
+LEADER_PATIENCE = 120.0  # s that the part of a replay waits for its leader to come back
+WAITING_SAID = 10.0  # s after which a launcher says again whom it waits for
+WINDOW_PERIOD = 1.0  # s after which the window of a replay is said again
 WAKE_PERIOD = 0.2  # s between two looks at deadlines
 
 LAUNCHER = "caneflow"  # the launcher's name in the merged log
@@ -48,6 +71,14 @@ class Ready:
     """A node hears and is heard."""
 
     node: str
+    there: bool = True  # False: not any more
+
+
+@dataclass(frozen=True)
+class StatusAsked:
+    """Somebody wants to know how the flow is."""
+
+    query: zenoh.Query
 
 
 @dataclass(frozen=True)
@@ -61,7 +92,8 @@ class NodeState:
 
     plan: NodePlan
     restart: Restart
-    state: str = "starting"  # starting, ready, waiting (for its restart), failed
+    here: bool = True  # False: another machine's launcher starts it
+    state: str = "starting"  # starting, ready, waiting (for its restart), failed; away: on a machine out of reach
     pid: int = 0
     started_at: float = 0.0  # s, monotonic
     restart_at: float = 0.0  # s, monotonic
@@ -90,56 +122,175 @@ class Outcome:
 class Launcher:
     """One run of a deployment."""
 
-    def __init__(self, deployment: Deployment, restarts: dict[str, Restart], report: Report) -> None:
+    def __init__(
+        self, deployment: Deployment, restarts: dict[str, Restart], report: Report, keys: Path | None = None
+    ) -> None:
+        """`keys`: the folder with this machine's certificate, where the flow has several machines."""
+        self._keys = keys
         self._events: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._restarts = restarts
         self._report = report
         self._deployment = deployment
+        self._company = Company.of(deployment)
+        self._leads = self._company is None or self._company.site.leads
+        site = deployment.site
+        self._clocks = None if site is None else Clocks(deployment.flow, site.name, site.others)
+        self._over = False  # the leader has said so
+        self._alone_since: float | None = None  # s, monotonic: since when the leader is gone
         self._nodes: dict[str, NodeState] = {}
         self._barrier_passed = False
         self._started_s = 0.0  # monotonic
         self._until = BEGIN
+        self._say_window_at = 0.0  # s, monotonic
         self._outcome = Outcome()
+        self._state_folder: Path | None = None
+        self._observed = Observations()
 
     def run(self) -> Outcome:
         """Start everything, follow it to its end, end everything."""
         ports = Ports()
         try:
             endpoint = ports.endpoint()
-            deployment = linked(self._deployment, ports, endpoint)
-            self._nodes = {
-                name: NodeState(plan, self._restarts.get(name, RECORDER_RESTART))
-                for name, plan in deployment.plans.items()
-            }
             with (
-                open_session(listen=[endpoint], replay=deployment.replay) as self._session,
-                RunDirectory(deployment.flow, endpoint) as self._directory,  # tools may attach from here on
+                self._open_session(endpoint) as self._session,
+                RunDirectory(self._deployment.flow, endpoint) as self._directory,  # tools may attach from here on
                 Processes(self._events, self._directory.path) as self._processes,
                 self._signals(),
             ):
                 self._subscribe()
-                for node in self._nodes.values():
-                    self._start(node)
-                self._follow()
+                if self._gather():
+                    self._take_nodes(linked(self._deployment, ports, endpoint))
+                    for node in self._nodes.values():
+                        if node.here:
+                            self._start(node)
+                    self._follow()
+                self._part()
                 self._stop()
+                self._let_others_leave()
         finally:
             ports.release()
         self._conclude()
         return self._outcome
 
+    # --- the other machines -----------------------------------------------------------------------------------
+
+    def _open_session(self, endpoint: str) -> zenoh.Session:
+        site, replay = self._deployment.site, self._deployment.replay
+        if site is None:
+            return open_session(listen=[endpoint], replay=replay)
+        site, secured = links_between(self._deployment, site, self._keys)
+        more = {**LINK_SETTINGS, **secured}
+        return open_session(
+            mode="router", listen=[endpoint, *site.listen], connect=site.connect, replay=replay, more=more
+        )
+
+    def _gather(self) -> bool:
+        """Wait until every machine of the flow is there; False when the run ends before."""
+        company = self._company
+        if company is None:
+            return True
+        company.join(self._session, self._deployment.flow, self._events.put)
+        if self._clocks is not None:
+            self._clocks.open(self._session, self._events.put)
+        self._report(LAUNCHER, f"{company.site.leader} leads; {company.waits_for(self._session)}")
+        later = []
+        say_again = time.monotonic() + WAITING_SAID
+        while company.missing and not self._is_over():
+            if time.monotonic() > say_again:
+                say_again += WAITING_SAID
+                self._report(LAUNCHER, f"still {company.waits_for(self._session)}")
+            for event in self._next_events():
+                if isinstance(event, Ready | Said | Began):
+                    later.append(event)
+                else:
+                    self._take(event)
+        for event in later:
+            self._events.put(event)
+        self._deployment = with_recorders_on(self._deployment, company.recording)
+        return not self._is_over()
+
+    def _take_nodes(self, deployment: Deployment) -> None:
+        """Know the nodes that start here; the leader those of all machines."""
+        self._state_folder = None
+        if self._company and self._company.leader_run:
+            # The next launcher on this machine may go on where this one was killed, if the same leader still runs.
+            self._state_folder = state_folder(deployment.flow, self._company.site.name, self._company.leader_run)
+        self._nodes = {
+            name: NodeState(plan, self._restarts.get(name, RECORDER_RESTART), here=deployment.runs_here(name))
+            for name, plan in deployment.plans.items()
+            if self._leads or deployment.runs_here(name)
+        }
+
+    def _take_word(self, company: Company, word: Word) -> None:
+        """Take what another machine's launcher says."""
+        match word:
+            case Joined() | Left():
+                said = company.take(word)
+                if said is not None:
+                    self._report(LAUNCHER, said)
+                if word.machine == company.site.leader:
+                    self._take_leader(company, word)
+            case Began():
+                self._pass_barrier()
+            case Ended(failures, interrupted):
+                self._over = True
+                self._outcome.failures += [f"{company.site.leader}: {failure}" for failure in failures]
+                self._outcome.interrupted = self._outcome.interrupted or interrupted
+            case Failed(machine, failures):
+                self._outcome.failures += [f"{machine}: {failure}" for failure in failures]
+
+    def _take_leader(self, company: Company, word: Joined | Left) -> None:
+        leader = company.site.leader
+        self._alone_since = None if leader in company.present else time.monotonic()
+        if isinstance(word, Joined) and company.leader_run is None:
+            company.leader_run = word.run
+        elif isinstance(word, Joined) and company.leader_run != word.run:
+            company.leader_run = word.run
+            if self._deployment.replay:
+                self._outcome.failures.append(f"{leader} has begun another replay; this part belongs to the one before")
+
+    def _part(self) -> None:
+        """Tell the other machines that it is over, for all or for this one."""
+        if self._company is None:
+            return
+        outcome, site = self._outcome, self._company.site
+        if self._leads:
+            word: Ended | Failed = Ended(outcome.failures, outcome.interrupted)
+            self._company.tell(self._session, self._deployment.flow, word)
+        elif outcome.failures and not self._over:
+            self._company.tell(self._session, self._deployment.flow, Failed(site.name, outcome.failures))
+
+    def _let_others_leave(self) -> None:
+        """The leader's session is how the others hear the end: close it after them."""
+        if self._company is None:
+            return
+        deadline = time.monotonic() + 2 * STOP_PATIENCE
+        while self._leads and self._company.present and time.monotonic() < deadline:
+            for event in self._next_events():
+                if isinstance(event, Left):
+                    self._company.take(event)
+        if self._state_folder is not None and not self._outcome.failures:
+            remove_state_folder(self._state_folder)
+
     # --- what comes -------------------------------------------------------------------------------------------
 
     def _subscribe(self) -> None:
         flow = self._deployment.flow
-        self._held = [
-            self._session.declare_subscriber(control_key(flow, "progress", "*"), self._hearing(Progress)),
+        self._held: list[object] = [
             self._session.declare_subscriber(control_key(flow, "counters", "*"), self._hearing(Counters)),
             self._session.liveliness().declare_subscriber(
                 control_key(flow, "ready", "*"),
                 zenoh.handlers.Callback(self._on_token, indirect=False),
                 history=True,
             ),
+            self._session.declare_queryable(
+                control_key(flow, "status"),
+                zenoh.handlers.Callback(self._on_status_asked, indirect=False),
+            ),
         ]
+        if self._leads:
+            key = control_key(flow, "progress", "*")
+            self._held.append(self._session.declare_subscriber(key, self._hearing(Progress)))
 
     def _hearing(self, kind: type[Progress] | type[Counters]) -> "zenoh.handlers.Callback[zenoh.Sample]":
         def put(sample: zenoh.Sample) -> None:
@@ -148,16 +299,22 @@ class Launcher:
         return zenoh.handlers.Callback(put, indirect=False)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._events.put(Ready(str(sample.key_expr).rpartition("/")[2]))
+        there = sample.kind == zenoh.SampleKind.PUT
+        self._events.put(Ready(str(sample.key_expr).rpartition("/")[2], there))
+
+    def _on_status_asked(self, query: zenoh.Query) -> None:
+        self._events.put(StatusAsked(query))
 
     def _follow(self) -> None:
         """Take events until the run has ended, well or badly."""
-        while not (self._outcome.failures or self._outcome.interrupted or self._all_ended()):
+        while not (self._is_over() or self._all_ended()):
             for event in self._next_events():
                 self._take(event)
             self._look_at_deadlines()
             self._open_window()
+            if self._clocks is not None:
+                self._clocks.look()
+            self._observed.look(self._nodes.values())
 
     def _next_events(self) -> Iterator[object]:
         with suppress(queue.Empty):
@@ -170,8 +327,8 @@ class Launcher:
             case Line(node, text):
                 self._nodes[node].last_line = text or self._nodes[node].last_line
                 self._report(node, text)
-            case Ready(node):
-                self._take_ready(self._nodes[node])
+            case Ready(node, there) if node in self._nodes:
+                self._take_ready(self._nodes[node], there=there)
             case Exited():
                 self._processes.forget(event)
                 self._take_exit(self._nodes[event.node], event)
@@ -179,6 +336,18 @@ class Launcher:
                 self._outcome.interrupted = True
             case Said():
                 self._take_said(event)
+            case Joined() | Left() | Began() | Ended() | Failed() if self._company is not None:
+                self._take_word(self._company, event)
+            case Answer() if self._clocks is not None:
+                if (said := self._clocks.take(event)) is not None:
+                    self._report(LAUNCHER, said)
+            case StatusAsked(query):
+                here = {name: node for name, node in self._nodes.items() if node.here}
+                deployment = self._deployment
+                machine = deployment.site.name if deployment.site else ""
+                status = self._observed.status(deployment.flow, machine, here, replay=deployment.replay)
+                with query:
+                    query.reply(query.key_expr, encode(status))
 
     def _take_said(self, said: Said) -> None:
         try:
@@ -186,6 +355,8 @@ class Launcher:
         except MessageError as error:
             self._report(LAUNCHER, f"a {said.kind.__name__} refused: {error}")
             return
+        if isinstance(message, Counters):
+            self._observed.note(message)
         node = self._nodes.get(message.node)
         if node is None:
             return
@@ -195,13 +366,21 @@ class Launcher:
         else:
             node.counters = message
 
-    def _take_ready(self, node: NodeState) -> None:
+    def _take_ready(self, node: NodeState, *, there: bool) -> None:
+        if not there:
+            if not node.here:
+                node.state = "away"
+            return  # the end of a process of this machine is told by the process
         node.state = "ready"
-        if not self._barrier_passed and all(other.state == "ready" for other in self._nodes.values()):
-            self._barrier_passed = True
-            self._started_s = time.monotonic()
+        if self._leads and all(other.state == "ready" for other in self._nodes.values()):
+            self._pass_barrier()
         if self._barrier_passed:
             self._say_start()
+
+    def _pass_barrier(self) -> None:
+        if not self._barrier_passed:
+            self._barrier_passed = True
+            self._started_s = time.monotonic()
 
     def _take_exit(self, node: NodeState, exited: Exited) -> None:
         if exited.pid != node.pid:
@@ -234,6 +413,10 @@ class Launcher:
         if self._barrier_passed and plan.module == REPLAYER_MODULE:
             settings = {**plan.settings, "started_s": self._started_s}
             plan = msgspec.structs.replace(plan, settings=settings)
+        if self._company is not None:
+            folder = str(self._state_folder) if self._state_folder else None
+            away = self._company.out_of_reach(plan.readers)
+            plan = msgspec.structs.replace(plan, absent=away, state_folder=folder)
         plan.write(path)
         node.state = "starting"
         node.started_at = time.monotonic()
@@ -241,7 +424,11 @@ class Launcher:
 
     def _look_at_deadlines(self) -> None:
         now = time.monotonic()
+        if self._deployment.replay and self._alone_since and now - self._alone_since > LEADER_PATIENCE:
+            self._outcome.failures.append(f"the leading machine has not come back for {LEADER_PATIENCE:g} s")
         for node in self._nodes.values():
+            if not node.here:
+                continue
             if node.state == "waiting" and now >= node.restart_at:
                 self._start(node)
             elif node.state == "starting" and now - node.started_at > node.plan.ready_timeout_s:
@@ -251,7 +438,7 @@ class Launcher:
 
     def _open_window(self) -> None:
         """Let the sources of a replay go on: as far as the slowest reader, and a window beyond."""
-        if not (self._barrier_passed and self._deployment.replay):
+        if not (self._leads and self._barrier_passed and self._deployment.replay):
             return
         slowest = min((node.handled for node in self._nodes.values() if node.plan.inputs), default=END)
         if slowest >= END - 1:
@@ -259,7 +446,10 @@ class Launcher:
         until = max(slowest, self._deployment.origin) + REPLAY_WINDOW
         if until >= self._until + REPLAY_WINDOW // 16:
             self._until = until
-            self._tell("window", encode(Window(until)))
+        elif time.monotonic() < self._say_window_at:
+            return
+        self._say_window_at = time.monotonic() + WINDOW_PERIOD  # the last word may have met a broken link
+        self._tell("window", encode(Window(self._until)))
 
     def _say_start(self) -> None:
         self._tell("start", b"")
@@ -270,8 +460,11 @@ class Launcher:
         key = control_key(self._deployment.flow, what)
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
+    def _is_over(self) -> bool:
+        return bool(self._outcome.failures or self._outcome.interrupted or self._over)
+
     def _all_ended(self) -> bool:
-        return all(node.handled == END for node in self._nodes.values())
+        return self._leads and all(node.handled == END for node in self._nodes.values())
 
     def _stop(self) -> None:
         """End sources and operators, then the sinks, which take what was still on its way."""

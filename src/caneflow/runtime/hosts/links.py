@@ -7,7 +7,9 @@ The defaults of Zenoh lose data silently: peers do not relay for peers, a lost l
 import json
 import random
 import socket
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import zenoh
 
@@ -15,7 +17,7 @@ from caneflow.runtime.errors import DataflowError
 
 LIVE_LEASE = 1_000  # ms until a frozen peer is given up
 REPLAY_LEASE = 60_000  # ms: a replay waits for a reader that stalls, it does not lose it
-WAIT_BEFORE_CLOSE = 600_000_000  # us that a blocking put waits before the link is closed
+WAIT_BEFORE_CLOSE = 600_000_000  # us that a replay's blocking put waits before the link is closed
 # A burst of 100 small express samples with Zenoh's default queue of 2 batches and 1 ms: 12 % dropped on loopback.
 # With these: none, and no put took longer than 3 ms.
 BATCHES = 16  # that may wait to be sent; Zenoh's greatest
@@ -31,14 +33,25 @@ PRIORITIES = (
     "background",
 )
 RETRY = {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2}
+SENT_AT_BYTES = 8  # of a sample's attachment: ns, little-endian
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ports, so that no outgoing connection takes one
 
 
 def open_session(
-    *, mode: str = "peer", listen: Sequence[str] = (), connect: Sequence[str] = (), replay: bool = False
+    *,
+    mode: str = "peer",
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    replay: bool = False,
+    more: Mapping[str, Any] | None = None,
 ) -> zenoh.Session:
-    """A session on exactly these endpoints; raises DataflowError when it cannot be opened."""
+    """A session on exactly these endpoints; raises DataflowError when it cannot be opened.
+
+    `more`: further settings of Zenoh, by path.
+    """
     zenoh.init_log_from_env_or("error")
+    # Live, a router that waits for a dead link longer than the lease would hold up the nodes that dial it.
+    patience = WAIT_BEFORE_CLOSE if replay else LIVE_LEASE * 1_000
     settings = {
         "mode": mode,
         "listen/endpoints": list(listen),
@@ -50,7 +63,8 @@ def open_session(
         "transport/link/tx/lease": REPLAY_LEASE if replay else LIVE_LEASE,
         "transport/link/tx/queue/size": {priority: BATCHES if priority == "data" else 2 for priority in PRIORITIES},
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": patience,
+        **(more or {}),
     }
     config = zenoh.Config()
     for key, value in settings.items():
@@ -61,6 +75,19 @@ def open_session(
         where = ", ".join((*listen, *connect))
         cause = str(error).partition(" at /")[0].strip()  # Zenoh adds the place in its own source
         raise DataflowError(f"no Zenoh session on {where}: {cause}") from error
+
+
+def sending_now() -> bytes:
+    """What a writer attaches to a sample, to say when it was sent."""
+    return time.time_ns().to_bytes(SENT_AT_BYTES, "little")
+
+
+def sent_at(sample: zenoh.Sample) -> int:
+    """When the writer put the sample (ns), as it says in the attachment; 0: it does not say."""
+    if sample.attachment is None:
+        return 0
+    raw = sample.attachment.to_bytes()
+    return int.from_bytes(raw, "little") if len(raw) == SENT_AT_BYTES else 0
 
 
 class Ports:

@@ -3,10 +3,17 @@
 import os
 import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import psutil
+
+from caneflow.runtime.errors import DataflowError
+
+if TYPE_CHECKING:
+    from caneflow.messages.rig import Rig
 
 
 class RunningFlow(msgspec.Struct, frozen=True):
@@ -35,14 +42,58 @@ class RunDirectory:
 
 
 def running_flows() -> list[RunningFlow]:
-    """The flows that run on this machine under this user."""
-    found = [msgspec.json.decode(path.read_bytes(), type=RunningFlow) for path in _root().glob("*/flow.json")]
-    return sorted((flow for flow in found if psutil.pid_exists(flow.pid)), key=lambda flow: flow.flow)
+    """The flows that run on this machine and that this user may see: the own ones; root sees all."""
+    found: dict[int, RunningFlow] = {}
+    for path in (path for root in _roots() for path in root.glob("*/flow.json")):
+        with suppress(OSError, msgspec.DecodeError):  # it may be ending, or be somebody else's
+            flow = msgspec.json.decode(path.read_bytes(), type=RunningFlow)
+            if psutil.pid_exists(flow.pid):
+                found[flow.pid] = flow
+    return sorted(found.values(), key=lambda flow: (flow.flow, flow.pid))
+
+
+def rig_of(flow: str) -> "Rig":
+    """The rig that the nodes of a flow on this machine were given; an empty one when there is no such flow here."""
+    from caneflow.messages.rig import Rig, read_rig  # here, as these take as long to import as all the rest
+    from caneflow.runtime.plan import NodePlan
+
+    for path in (path for root in _roots() for path in sorted(root.glob(f"{flow}-*/*.json"))):
+        if path.name != "flow.json" and psutil.pid_exists(int(path.parent.name.rpartition("-")[2])):
+            with suppress(DataflowError):  # it may be ending, or be somebody else's
+                return read_rig(NodePlan.read(path).rig)
+    return Rig()
 
 
 def _root() -> Path:
     base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     return Path(base) / f"caneflow-{os.getuid()}"
+
+
+def _roots() -> list[Path]:
+    """Where flows may have been started: by this session, by one with another environment, by another user."""
+    roots = {_root(): None}
+    for base in (Path(tempfile.gettempdir()), Path("/tmp"), *Path("/run/user").glob("*")):  # noqa: S108 - looked at only
+        with suppress(OSError):  # that of another user
+            roots.update(dict.fromkeys(base.glob("caneflow-*")))
+    return list(roots)
+
+
+def state_folder(flow: str, machine: str, run: str) -> Path:
+    """Where snapshots outlive a launcher of this machine, for as long as the leader's run goes on."""
+    # systemd names a folder that outlives a reboot (StateDirectory=).
+    base = os.environ.get("STATE_DIRECTORY")
+    parent = (Path(base.partition(":")[0]) if base else _root()) / f"state-{flow}-{machine}"
+    path = parent / run
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for other in parent.iterdir():
+        if other != path:
+            shutil.rmtree(other, ignore_errors=True)
+    return path
+
+
+def remove_state_folder(path: Path) -> None:
+    """Remove the snapshots of a run that ended in order."""
+    shutil.rmtree(path.parent, ignore_errors=True)
 
 
 def _sweep() -> None:

@@ -21,7 +21,7 @@ class Feed:
         self.node = node
         self.outputs = {port: Departures(plan) for port, plan in outputs.items()}
         self.ended = False
-        self.refused = 0  # samples that the source brought and that cannot be sent
+        self.unsent = dict.fromkeys(outputs, 0)  # by port the samples that the source brought and that cannot be sent
         self._ordered = ordered  # stamps increase over all ports together
         self._quiet = BEGIN
 
@@ -32,7 +32,15 @@ class Feed:
             raise DataflowError(f"{self.node}: brought port {port!r}; it has {', '.join(self.outputs) or 'none'}")
         if self._ordered:
             self.nothing_until(sample.stamp - 1)
-        return self._payload(departures, sample)
+        payload = self._payload(departures, sample)
+        if payload is None:
+            self.unsent[port] += 1
+        return payload
+
+    @property
+    def refused(self) -> int:
+        """How many samples the source brought that cannot be sent."""
+        return sum(self.unsent.values())
 
     def nothing_until(self, stamp: int) -> None:
         """Note that no further sample with a stamp at or before `stamp` (ns) will be brought."""
@@ -50,8 +58,7 @@ class Feed:
     def _payload(self, departures: Departures, sample: Sample | Encoded) -> bytes | None:
         """The sample's bytes under its number in this run: a recording may begin in the middle, or have gaps."""
         if sample.stamp <= departures.last_stamp:
-            self.refused += 1
-            if self.refused == 1:
+            if not self.refused:
                 stamps = f"stamp {sample.stamp} after {departures.last_stamp}"
                 log.warning("%s: not sent, time goes backwards: %s (counted from now on)", departures.plan.key, stamps)
             return None
@@ -62,8 +69,7 @@ class Feed:
             try:
                 sample = decode(sample.payload, sample.kind)
             except MessageError as error:
-                self.refused += 1
-                if self.refused == 1:
+                if not self.refused:
                     log.warning("%s: not sent, a bad sample: %s (counted from now on)", departures.plan.key, error)
                 return None
         return numbered(sample, departures.number(sample))

@@ -29,6 +29,7 @@ class Arrivals:
     last_stamp: int = BEGIN  # ns
     unreadable: int = 0  # refused samples whose seq is not known: they are not lost as well
     left_out: deque[LeftOut] = field(default_factory=lambda: deque(maxlen=NOTES_KEPT))  # a live host tells them
+    clock_offset: int | None = 0  # ns, the writer's clock less this machine's; None: not known
     patient: bool = False  # what is missing can be had again: later samples wait for it
     ahead: dict[int, Sample] = field(default_factory=dict)  # those that wait, by seq
     handled_seq: int = -1  # of the last sample that needs no asking for
@@ -110,7 +111,9 @@ class Arrivals:
     def too_old(self, message: Sample, now: int) -> bool:
         """Whether `message` is older than the graph wants it."""
         limit = self.plan.max_age_ms
-        return limit is not None and now - message.stamp > limit * 1e6
+        if limit is None or self.clock_offset is None:
+            return False  # on a clock that is not known yet nothing is old
+        return now + self.clock_offset - message.stamp > limit * 1e6
 
     def leave_out(self, message: Sample, reason: str) -> None:
         """Note a sample that came and is not handled."""

@@ -56,6 +56,10 @@ class Tap:
         if not self.finished:
             self._sink.note(key, payload, time)
 
+    def asked(self, question: bytes, time: int) -> bytes | None:
+        """The sink's answer to a tool's question."""
+        return None if self.finished else self._sink.asked(question, time)
+
     def idle(self, time: int) -> None:
         """Give the sink a moment when nothing comes."""
         if not self.finished:

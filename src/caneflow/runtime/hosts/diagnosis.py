@@ -1,0 +1,330 @@
+"""What is wrong with a running flow: from the way to it, link by link, to its nodes and wires; with what to try.
+
+A denial by TLS or by access control looks to Zenoh like a link or a reader that is not there, so each step is taken
+on its own: the name, the port, the certificates, the link, the answer.
+"""
+
+import platform
+import socket
+import ssl
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import psutil
+import zenoh
+
+import caneflow
+from caneflow.messages import control_key
+from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.hosts.attach import (
+    ANSWER_TIMEOUT,
+    ANY,
+    DEFAULT_KEYS,
+    endpoint_of,
+    link_settings,
+    observer_credentials,
+    timed_statuses,
+)
+from caneflow.runtime.hosts.links import open_session
+from caneflow.runtime.wording import listed, one_line
+
+DIAL_TIMEOUT = 2.0  # s that a port may take to accept
+REFUSAL_TIME = 0.5  # s that a TLS server takes to refuse a certificate: it says so after the handshake
+CLOCK_TOLERANCE = 0.005  # s between two machines; ages and latencies between them are off by it
+STALE = 3.0  # s without word from a node that says its counters once a second
+SETTLED = 5.0  # s from the start of a node, after which its wires are judged
+
+PLACES: dict[str, tuple[str, tuple[str, ...]]] = {  # where a sample is lost: what happened, what to try
+    "sender": ("could not be sent: time goes backwards, or the bytes are bad", ("see the writer's log lines",)),
+    "wire": ("never came", ("is the link fast enough? was the writer restarted? see `caneflow status`, restarts",)),
+    "decode": ("broke the contract, or the program refused them", ("see the reader's log lines: each cause once",)),
+    "queue": ("fell out of a full queue, or were too old", ("the reader is too slow: `caneflow top`",)),
+    "late": (
+        "came after the graph had gone on",
+        ("a larger max_lag_ms on this input; see its age in `caneflow status`",),
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One thing that was looked at."""
+
+    node: str  # or edge, machine, endpoint: where
+    state: Literal["ok", "look", "bad"]
+    text: str
+    attempts: tuple[str, ...] = ()  # what to try next, the likeliest first
+
+
+def diagnosed(flow: str | None = None, at: str | None = None, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
+    """What there is to say of the running flow `flow`, on this machine or at the endpoint `at`."""
+    try:
+        endpoint = at or endpoint_of(flow)
+    except DataflowError as error:
+        yield Finding(node=flow or "flow", state="bad", text=str(error), attempts=TO_FIND_A_FLOW)
+        return
+    for finding in way_to(endpoint, keys):
+        yield finding
+        if finding.state == "bad":
+            return
+    try:
+        session = open_session(mode="client", connect=[endpoint], more=link_settings(endpoint, keys))
+    except DataflowError as error:
+        attempts = ("is it a Zenoh endpoint of caneflow? with keys it is tls/..., without tcp/...",)
+        yield Finding(node=endpoint, state="bad", text=one_line(error), attempts=attempts)
+        return
+    with session:
+        yield from _running(session, flow or ANY, endpoint)
+
+
+TO_FIND_A_FLOW = (
+    "start it: caneflow run FILE; with several machines on each of them: --machine NAME",
+    "one of another user is seen by that user and by root only",
+    "one on another machine: --at tcp/HOST:PORT, as `machines:` in its file says",
+)
+
+
+# --- the way there ----------------------------------------------------------------------------------------------
+
+
+def way_to(endpoint: str, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
+    """Whether somebody listens at `endpoint`, and takes this side's certificate; a finding that is bad is the last."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    if not (protocol and host and port.isdigit()):
+        text = f"{endpoint} is no endpoint"
+        yield Finding(node=endpoint, state="bad", text=text, attempts=("give e.g. --at tcp/gateway.local:7447",))
+        return
+    try:
+        link = socket.create_connection((host.strip("[]"), int(port)), timeout=DIAL_TIMEOUT)
+    except OSError as error:
+        yield _no_way(endpoint, host, port, error)
+        return
+    with link:
+        yield Finding(node=endpoint, state="ok", text="somebody listens")
+        if protocol == "tls":
+            yield _handshake(endpoint, host, link, keys)
+
+
+def _no_way(endpoint: str, host: str, port: str, error: OSError) -> Finding:
+    attempts: tuple[str, ...]
+    if isinstance(error, socket.gaierror):
+        text, attempts = f"no machine is called {host}", (f"ping {host}; else give its address in numbers",)
+    elif isinstance(error, ConnectionRefusedError):
+        text = f"{host} is there, but nobody listens on port {port}"
+        attempts = (f"on {host}: caneflow status; does the flow run?", "is it the port that `machines:` says?")
+    else:
+        text = f"no answer: {error.strerror or error}"
+        attempts = (
+            f"ping {host}",
+            f"let it through the firewall of {host}: sudo ufw allow proto tcp to any port {port}",
+        )
+    return Finding(node=endpoint, state="bad", text=text, attempts=attempts)
+
+
+def _handshake(endpoint: str, host: str, link: socket.socket, keys: Path) -> Finding:
+    """Who of the two sides refuses the other's certificate, if one does."""
+    attempts: tuple[str, ...]
+    try:
+        own = observer_credentials(keys)
+    except DataflowError as error:
+        return Finding(node=endpoint, state="bad", text=str(error))
+    if own is None:
+        text = f"takes a certificate, and {keys} holds none"
+        attempts = (f"caneflow keys add NAME --observer, where ca.key is; then copy its three files to {keys}",)
+        return Finding(node=endpoint, state="bad", text=text, attempts=attempts)
+    context = ssl.create_default_context(cafile=str(own.authority))
+    context.check_hostname = False  # addresses change; the common name says who it is
+    context.load_cert_chain(own.certificate, own.key)
+    try:
+        with context.wrap_socket(link, server_hostname=host) as secured:
+            secured.settimeout(REFUSAL_TIME)
+            with suppress(TimeoutError):  # silence: it waits for us, so it took the certificate
+                secured.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        text = f"denied by TLS, on this side: {error.verify_message}"
+        attempts = (f"{own.authority} is of another authority: copy the ca.crt of the flow", "see `caneflow keys list`")
+        return Finding(node=endpoint, state="bad", text=text, attempts=attempts)
+    except ssl.SSLError as error:
+        text = f"denied by TLS, on the other side: {_reason(error)}"
+        attempts = (
+            f"make {own.certificate.name} with the flow's own ca.key",
+            "until when does it hold? caneflow keys list",
+        )
+        return Finding(node=endpoint, state="bad", text=text, attempts=attempts)
+    except OSError as error:
+        text = f"listens, but does not speak TLS: {error.strerror or error}"
+        return Finding(node=endpoint, state="bad", text=text, attempts=(f"--at tcp/{endpoint.partition('/')[2]}",))
+    return Finding(node=endpoint, state="ok", text=f"TLS, and it takes {own.certificate.name}")
+
+
+def _reason(error: ssl.SSLError) -> str:
+    return (error.reason or str(error)).lower().replace("_", " ")
+
+
+# --- what answers -----------------------------------------------------------------------------------------------
+
+
+def _running(session: zenoh.Session, flow: str, endpoint: str) -> Iterator[Finding]:
+    try:
+        answers = timed_statuses(session, flow)
+    except DataflowError as error:
+        attempts = ("pip install the same version of caneflow on all machines",)
+        yield Finding(node=endpoint, state="bad", text=one_line(error), attempts=attempts)
+        return
+    if not answers:
+        yield _no_answer(flow, endpoint)
+        return
+    names = {answer.flow for answer, _ in answers}
+    if len(names) > 1:
+        text = f"several flows answer: {listed(sorted(names))}"
+        yield Finding(node=endpoint, state="bad", text=text, attempts=("name one",))
+        return
+    for status, offset in answers:
+        yield from _machine(status, offset)
+        yield from _nodes(session, status)
+    known = [status for status, _ in answers]
+    yield from _edges(session, known)
+
+
+def _no_answer(flow: str, endpoint: str) -> Finding:
+    named = "any flow" if flow == ANY else flow
+    if endpoint.startswith("tls/"):
+        text = f"linked, but nothing of {named} comes through: denied by access control, or another flow runs there"
+        attempts: tuple[str, ...] = (
+            "is the certificate an observer's? caneflow keys list",
+            "what a denied one asks is dropped without a word: ask on the machine itself, without --at",
+        )
+    else:
+        text = f"linked, but no launcher of {named} answers within {ANSWER_TIMEOUT:g} s"
+        attempts = (
+            "is it ending, or stopped (SIGSTOP)? try again",
+            "is it of another version? caneflow --version there",
+        )
+    return Finding(node=endpoint, state="bad", text=text, attempts=attempts)
+
+
+def _machine(status: FlowStatus, offset: tuple[float, float]) -> Iterator[Finding]:
+    """Version and clock of one launcher's machine, as seen from here."""
+    where = status.machine or status.host
+    ahead, uncertainty = offset
+    kind = "replay" if status.replay else "live"
+    text = f"{status.flow}, {kind}, up {status.uptime:.0f} s, caneflow {status.version}, pid {status.pid}"
+    yield Finding(node=where, state="ok", text=text)
+    if status.version != caneflow.__version__:
+        text = f"runs caneflow {status.version}, here is {caneflow.__version__}"
+        yield Finding(node=where, state="look", text=text, attempts=("pip install the same version on both",))
+    if status.host == platform.node():
+        return
+    text = f"its clock is {1e3 * abs(ahead):.1f} ms {'ahead' if ahead > 0 else 'behind'} (+-{1e3 * uncertainty:.1f} ms)"
+    if abs(ahead) - uncertainty > CLOCK_TOLERANCE:
+        attempts = ("timedatectl on both: is the clock synchronised? else sudo apt install chrony",)
+        text += "; ages and latencies between the machines are off by it"
+        yield Finding(node=where, state="look", text=text, attempts=attempts)
+    else:
+        yield Finding(node=where, state="ok", text=text)
+
+
+def _nodes(session: zenoh.Session, status: FlowStatus) -> Iterator[Finding]:
+    attempts: tuple[str, ...]
+    for node in status.nodes:
+        said = f"; it said: {node.said}" if node.said else ""
+        if node.state != "ready":
+            text = f"is {node.state}{said}"
+            attempts = ("its log lines say why; run its program's test alone", "more time: ready_timeout_s in the file")
+            yield Finding(node=node.node, state="bad", text=text, attempts=attempts)
+        elif node.counted is not None and node.counted > STALE and any(node.rates.values()):
+            text = f"has said nothing for {node.counted:.0f} s, pid {node.pid} is there{said}"
+            attempts = (f"is it stopped, or in a long computation? py-spy dump --pid {node.pid}",)
+            yield Finding(node=node.node, state="bad", text=text, attempts=attempts)
+        elif node.restarts:
+            text = f"was restarted {node.restarts} x{said}"
+            yield Finding(node=node.node, state="look", text=text, attempts=("its log lines say why it ended",))
+        if status.host == platform.node():
+            yield from _links(node, status)
+
+
+def _links(node: NodeStatus, status: FlowStatus) -> Iterator[Finding]:
+    """Whether each link that the node should have is there: only the machine itself can tell."""
+    try:
+        sockets = psutil.Process(node.pid).net_connections(kind="tcp") if node.pid else []
+    except psutil.Error:
+        return  # somebody else's process, or it has just ended
+    listening = {each.laddr.port for each in sockets if each.status == psutil.CONN_LISTEN}
+    dialled = {each.raddr.port for each in sockets if each.status == psutil.CONN_ESTABLISHED and each.raddr}
+    listeners = {port: other.node for other in status.nodes for port in _ports(other.listen)}
+    for port in _ports(node.listen):
+        if port not in listening:
+            text = f"should listen on port {port}, and does not: its readers get nothing"
+            yield Finding(node=node.node, state="bad", text=text, attempts=("end the flow and start it again",))
+    missing = [port for port in _ports(node.connect) if port not in dialled]
+    for port in missing:
+        whom = listeners.get(port, "its launcher")
+        text = f"dials {whom} on port {port}, without success"
+        attempts = (f"is {whom} ready? it is dialled again every 0.2 s", "a firewall on loopback? sudo iptables -L")
+        yield Finding(node=node.node, state="bad", text=text, attempts=attempts)
+    up = [listeners.get(port, "the launcher") for port in _ports(node.connect) if port in dialled]
+    if not missing:
+        ports = ", ".join(map(str, _ports(node.listen)))
+        text = f"{f'listens on port {ports}; ' if ports else ''}linked to {listed(up)}"
+        yield Finding(node=node.node, state="ok", text=text)
+
+
+def _edges(session: zenoh.Session, answers: Sequence[FlowStatus]) -> Iterator[Finding]:
+    nodes = {node.node: node for status in answers for node in status.nodes}
+    writers = {(node.node, port): sent for node in nodes.values() for port, sent in node.sent.items()}
+    for status in answers:
+        for edge in status.edges:
+            yield from _edge(session, status, edge, nodes, writers)
+
+
+def _edge(
+    session: zenoh.Session,
+    status: FlowStatus,
+    edge: EdgeStatus,
+    nodes: dict[str, NodeStatus],
+    writers: dict[tuple[str, str], int],
+) -> Iterator[Finding]:
+    """What a wire lost, and why nothing comes."""
+    where = f"{edge.writer} > {edge.reader}"
+    for place, (what, attempts) in PLACES.items():
+        if lost := getattr(edge, place):
+            yield Finding(
+                node=where, state="look", text=f"{lost} samples lost ({place}): they {what}", attempts=attempts
+            )
+    writer, _, port = edge.writer.partition("/")
+    reader = nodes[edge.reader.partition(".")[0]]
+    sent = writers.get((writer, port), 0)
+    if edge.received or reader.uptime < SETTLED:
+        return
+    if not sent:
+        if writer in nodes and nodes[writer].state == "ready" and not status.replay:
+            text, attempts = "nothing was sent yet", (f"a device? caneflow doctor --devices; else see {writer}'s log",)
+            yield Finding(node=where, state="look", text=text, attempts=attempts)
+        return
+    key = control_key(status.flow, "edge", writer, reader.node)
+    with_reader = "answers to its writer's name" if _is_matched(session, key) else "is heard by nobody here"
+    text = f"{sent} samples were sent and none came; the reader {with_reader}"
+    attempts = (
+        f"do the links of {reader.node} and {writer} say bad above?",
+        "on two machines: is their link up (doctor on both), and may the key pass (access control: the file's wires)?",
+    )
+    yield Finding(node=where, state="bad", text=text, attempts=attempts)
+
+
+def _is_matched(session: zenoh.Session, key: str) -> bool:
+    """Whether somebody answers to `key`, as far as this session knows."""
+    querier = session.declare_querier(key)
+    time.sleep(0.05)  # what is matched is told a moment after the declaration
+    matched: bool = querier.matching_status.matching  # type: ignore[attr-defined]  # the stub says bool
+    querier.undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
+    return matched
+
+
+def _ports(endpoints: Sequence[str]) -> list[int]:
+    return [int(port) for each in endpoints if (port := each.rpartition(":")[2]).isdigit()]

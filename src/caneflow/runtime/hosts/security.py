@@ -1,0 +1,222 @@
+"""What a machine may send to another: mutual TLS says who it is, access control what it may do. Default deny.
+
+The rules come from the graph. Each launcher holds them against what comes in and against what goes out, so a
+machine that was taken over can neither write what is not its own nor read what it has no use for.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from caneflow.messages import MAX_PAYLOAD, control_key, sample_key
+from caneflow.runtime.dataflow.topology import is_open
+from caneflow.runtime.deployment import Deployment, Site, recorder_name
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.hosts.certificates import OBSERVER, Credentials, credentials
+from caneflow.runtime.plan import NodePlan
+
+Grants: TypeAlias = dict[str, list[str]]  # by kind of message the keys
+
+LOCAL = "tcp"  # the links within a machine; those between machines are TLS
+KINDS = (
+    "put",
+    "delete",
+    "reply",
+    "query",
+    "declare_subscriber",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+
+
+def tls(endpoint: str) -> str:
+    """The endpoint with TLS: the file says only host and port."""
+    return "tls/" + endpoint.partition("/")[2]
+
+
+def secured_links(deployment: Deployment, site: Site, own: Credentials) -> dict[str, Any]:
+    """Zenoh's settings for mutual TLS and for who may do what."""
+    control = access_control(deployment, site)
+    check_access_control(control)
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": str(own.authority),
+            "enable_mtls": True,
+            "listen_certificate": str(own.certificate),
+            "listen_private_key": str(own.key),
+            "connect_certificate": str(own.certificate),
+            "connect_private_key": str(own.key),
+            # Who is at the other end is known by its common name, at either end of the link; addresses change.
+            "verify_name_on_connect": False,
+            "close_link_on_expiration": True,
+        },
+        "access_control": control,
+        "low_pass_filter": [
+            {
+                "id": "no sample is larger",
+                "link_protocols": ["tls"],
+                "flows": ["ingress"],
+                "messages": ["put", "reply", "query"],
+                "key_exprs": _everything(deployment.flow),
+                "size_limit": MAX_PAYLOAD,
+            }
+        ],
+    }
+
+
+def links_between(deployment: Deployment, site: Site, keys: Path | None) -> tuple[Site, dict[str, Any]]:
+    """The site with the endpoints that its launcher opens, and Zenoh's settings for them.
+
+    With keys every link between machines is mutual TLS. Raises DataflowError when a link would lead beyond this
+    computer without keys, unless the file says `insecure: true`.
+    """
+    own = None if site.insecure or keys is None else credentials(keys, site.name)
+    if own is not None:
+        if deployment.records and site.name not in site.recorders:
+            raise DataflowError(f"--record: {site.name} may not read every stream; write machines.{site.name}.records")
+        behind_tls = replace(site, listen=tuple(map(tls, site.listen)), connect=tuple(map(tls, site.connect)))
+        return behind_tls, secured_links(deployment, site, own)
+    beyond = [endpoint for endpoint in (*site.listen, *site.connect) if is_open(endpoint)]
+    if beyond and not site.insecure:
+        raise DataflowError(
+            f"{site.name}: no keys for {beyond[0]} in {keys}; `caneflow keys init` and `caneflow keys add {site.name}` "
+            "make them (or write `insecure: true` for a network that only you are in)"
+        )
+    return site, {}
+
+
+def access_control(deployment: Deployment, site: Site) -> dict[str, Any]:
+    """The rules of one machine's launcher, as Zenoh takes them."""
+    everything = _everything(deployment.flow)
+    rules = [_rule("everything", "ingress", kind, everything) for kind in KINDS]
+    rules += [_rule("everything", "egress", kind, everything) for kind in KINDS]
+    subjects: list[dict[str, Any]] = [{"id": "here", "link_protocols": [LOCAL]}]
+    policies = [{"subjects": ["here"], "rules": [rule["id"] for rule in rules]}]
+    both_ways = {
+        other: (machine_grants(deployment, site, other, site.name), machine_grants(deployment, site, site.name, other))
+        for other in site.others
+    }
+    both_ways[OBSERVER] = observer_grants(deployment.flow)
+    for other, (comes, goes) in both_ways.items():
+        own = [_rule(other, "ingress", kind, keys) for kind, keys in comes.items() if keys]
+        own += [_rule(other, "egress", kind, keys) for kind, keys in goes.items() if keys]
+        rules += own
+        subjects.append({"id": other, "cert_common_names": [other]})
+        policies.append({"subjects": [other], "rules": [rule["id"] for rule in own]})
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
+
+
+def machine_grants(deployment: Deployment, site: Site, sender: str, receiver: str) -> Grants:
+    """What `sender` may send to `receiver`: samples that are read there, and what keeps the flow going."""
+    flow, leads = deployment.flow, sender == site.leader
+    senders = _nodes_on(deployment, site, sender)
+    receivers = _nodes_on(deployment, site, receiver)
+
+    def control(*parts: str) -> str:
+        return control_key(flow, *parts)
+
+    heard = [control("progress", "*"), control("counters", "*")]
+    heard += [control("failed", "*")] if leads else [control(word) for word in ("start", "window", "end")]
+    told = [control("progress", node) for node in senders] + [control("counters", node) for node in senders]
+    told += [control(word) for word in ("start", "window", "end")] if leads else [control("failed", sender)]
+    told += [control("late")] if receiver in site.recorders else []
+    heard += [control("late")] if sender in site.recorders else []
+    answered = [control("history", node, "*") for node in senders]
+    answered += [control("edge", node, reader) for node in receivers for reader in senders]
+    answered += [control("status"), control("clock", sender)]
+    asked = [control("history", node, "*") for node in receivers if _reads_of(deployment, site, sender, node)]
+    asked += [control("edge", node, reader) for node in senders for reader in receivers]
+    asked += [control("status"), control("clock", receiver)]
+    everybody = [control("ready", "*"), control("machine", "*", "*", "*", "*")]
+    return {
+        "put": [*_samples_between(deployment, site, sender, receiver), *told],
+        "declare_subscriber": [*_samples_between(deployment, site, receiver, sender), *heard],
+        "declare_queryable": answered,
+        "reply": answered,
+        "query": asked,
+        "liveliness_token": [control("ready", node) for node in senders] + [control("machine", sender, "*", "*", "*")],
+        "declare_liveliness_subscriber": everybody,
+        "liveliness_query": everybody,
+    }
+
+
+def observer_grants(flow: str) -> tuple[Grants, Grants]:
+    """What an observer may send, and what may be sent to it: it reads everything and writes nothing."""
+    everything = _everything(flow)
+    asks: Grants = {
+        "declare_subscriber": everything,
+        "query": [control_key(flow, "status")],
+        "declare_liveliness_subscriber": everything,
+        "liveliness_query": everything,
+    }
+    gets: Grants = {
+        "put": everything,
+        "delete": everything,
+        "declare_queryable": [control_key(flow, "status")],
+        "reply": [control_key(flow, "status")],
+        "liveliness_token": everything,
+    }
+    return asks, gets
+
+
+def check_access_control(control: Mapping[str, Any]) -> None:
+    """Raise DataflowError for rules that Zenoh would take without a word and not keep."""
+    rules, subjects = ({each["id"] for each in control[what]} for what in ("rules", "subjects"))
+    if not control.get("enabled") or control.get("default_permission") != "deny":
+        raise DataflowError("access control: is not on, or does not deny what is not allowed")
+    for what, known in (("rules", rules), ("subjects", subjects)):
+        if len(known) != len(control[what]):
+            raise DataflowError(f"access control: two {what} have one id")
+        for policy in control["policies"]:
+            if unknown := set(policy[what]) - known:
+                raise DataflowError(f"access control: a policy names {min(unknown)!r}; no such {what[:-1]}")
+    for rule in control["rules"]:
+        if unknown := set(rule["messages"]) - set(KINDS):
+            raise DataflowError(f"access control: rule {rule['id']!r} names the message {min(unknown)!r}; no such one")
+    for subject in control["subjects"]:
+        if not subject.get("cert_common_names") and not subject.get("link_protocols"):
+            raise DataflowError(f"access control: the subject {subject['id']!r} would be everybody")
+
+
+def _rule(name: str, way: str, kind: str, keys: list[str]) -> dict[str, Any]:
+    return {
+        "id": f"{name} {way} {kind}",
+        "permission": "allow",
+        "flows": [way],
+        "messages": [kind],
+        "key_exprs": list(dict.fromkeys(keys)),
+    }
+
+
+def _everything(flow: str) -> list[str]:
+    return ["**", control_key(flow, "**")]  # `**` does not stand for `@`
+
+
+def _nodes_on(deployment: Deployment, site: Site, machine: str) -> list[str]:
+    nodes = [name for name in deployment.plans if site.places[name] == machine]
+    recorder = recorder_name(machine)
+    return [*nodes, recorder] if machine in site.recorders and recorder not in nodes else nodes
+
+
+def _samples_between(deployment: Deployment, site: Site, writer: str, reader: str) -> list[str]:
+    """The keys that nodes on `writer` publish and nodes on `reader` read."""
+    plans = deployment.plans
+    written = {
+        sample_key(deployment.flow, name, port)
+        for name, plan in plans.items()
+        if site.places[name] == writer
+        for port in plan.outputs
+    }
+    if reader in site.recorders:
+        return sorted(written)
+    read = {wire.key for name, plan in plans.items() if site.places[name] == reader for wire in plan.inputs.values()}
+    return sorted(written & read)
+
+
+def _reads_of(deployment: Deployment, site: Site, reader: str, writer: str) -> bool:
+    """Whether a node on `reader` reads from the node `writer`."""
+    here: list[NodePlan] = [plan for name, plan in deployment.plans.items() if site.places[name] == reader]
+    return reader in site.recorders or any(wire.writer == writer for plan in here for wire in plan.inputs.values())

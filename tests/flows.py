@@ -1,0 +1,132 @@
+"""A cane that is spread over machines, a recording for it, and launchers to run it with: for several test files."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from caneflow.messages import Imu, RadarFrame, numbered, sample_key
+from caneflow.recording import Recording, RecordingWriter
+
+CANEFLOW = [sys.executable, "-m", "caneflow.command"]
+NODES = {
+    "imu": "run: drivers.bno055",
+    "radar": "run: drivers.p440",
+    "ground_speed": "run: operators.ground_speed, inputs: {frame: radar/frame, imu: imu/imu}",
+    "fusion": "run: operators.fusion, inputs: {imu: imu/imu, speed: ground_speed/speed}",
+}
+RIG = {"boresight": [0, 1, 0], "hand_height": 0.95, "aperture": 0.87, "pivot": [0, -0.3, 0]}
+
+
+def spread_cane(flow: str, machines: str, places: Mapping[str, str], more: str = "") -> str:
+    """The cane's dataflow.yaml; `places`: by node the machine that it runs on."""
+    nodes = "\n".join(f"  {name}: {{{node}, machine: {places[name]}}}" for name, node in NODES.items())
+    return f"flow: {flow}\n{more}machines:\n{machines}nodes:\n{nodes}\nresults: [fusion/pose]\n"
+
+
+def write_walk(path: Path, samples: int = 400) -> Path:
+    """A recording at 100 Hz of IMU samples and radar frames of noise: the graph runs on it, whatever it makes of it."""
+    rng = np.random.default_rng(3)
+    with RecordingWriter(path, flow="elsewhere", source="simulated", rig=RIG) as writer:
+        for seq in range(samples):
+            stamp = 1_000_000_000 + seq * 10_000_000
+            gyro, accel = rng.normal(size=(2, 3)).tolist()
+            imu = Imu(stamp=stamp, gyro=gyro, linear_accel=accel, orientation=(0.94, -0.342, 0.0, 0.0))
+            frame = RadarFrame(
+                stamp=stamp,
+                scans=rng.integers(-999, 999, size=(1, 96), dtype=np.int32),
+                scan_period=0.01,
+                range_start=0.5,
+                range_step=0.009149,
+                carrier=4.3e9,
+                bandwidth=1.7e9,
+            )
+            for node, port, message in (("imu", "imu", imu), ("radar", "frame", frame)):
+                key = sample_key("elsewhere", node, port)
+                writer.write(key, type(message), numbered(message, seq), stamp=stamp, seq=seq, log_time=stamp)
+    return path
+
+
+def results(path: Path) -> dict[str, list[bytes]]:
+    """The payloads of what operators published, by node/port."""
+    with Recording(path) as recording:
+        found: dict[str, list[bytes]] = {}
+        for sample in recording.samples():
+            if sample.node in ("ground_speed", "fusion"):
+                found.setdefault(f"{sample.node}/{sample.port}", []).append(sample.payload)
+        return found
+
+
+class Launched:
+    """A `caneflow` that was started and goes on; its output is kept as it comes."""
+
+    def __init__(self, log: Path, *args: object, inside: list[str] | None = None) -> None:
+        """`inside`: a command that runs what follows it, e.g. on another host. States are kept beside the log."""
+        self.log = log
+        with log.open("a") as output:
+            self.process = subprocess.Popen(
+                [*(inside or []), *CANEFLOW, *map(str, args)],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "STATE_DIRECTORY": str(log.parent)},
+            )
+
+    @property
+    def said(self) -> str:
+        return self.log.read_text()
+
+    def wait_for(self, text: str, deadline: float = 60.0) -> None:
+        wait_for(lambda: text in self.said or self.process.poll() is not None, text, deadline)
+        assert text in self.said, self.said
+
+    def ends(self, deadline: float = 90.0) -> int:
+        """The exit status, once it has ended."""
+        return self.process.wait(timeout=deadline)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@contextmanager
+def launchers() -> Iterator[Callable[..., Launched]]:
+    """Start launchers; whatever still runs at the end is ended."""
+    started: list[Launched] = []
+
+    def launch(*args: object, log: Path, inside: list[str] | None = None) -> Launched:
+        started.append(Launched(log, *args, inside=inside))
+        return started[-1]
+
+    try:
+        yield launch
+    finally:
+        for each in started:
+            if each.process.poll() is None:
+                each.process.send_signal(signal.SIGTERM)
+        for each in started:
+            try:
+                each.process.wait(timeout=15)
+            except subprocess.TimeoutExpired:
+                each.kill()
+
+
+def free_port(address: str = "127.0.0.1") -> int:
+    """A port that nobody listens on just now."""
+    with socket.socket() as probe:
+        probe.bind((address, 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def wait_for(condition: Callable[[], object], what: str, deadline: float = 30.0) -> None:
+    end = time.monotonic() + deadline
+    while not condition():
+        assert time.monotonic() < end, f"waited {deadline} s for {what}"
+        time.sleep(0.05)

@@ -1,0 +1,66 @@
+"""`caneflow new`: what it writes works as it is, passes its own test and fits into a flow by the printed line."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from caneflow import command
+from caneflow.runtime.dataflow.loading import examine
+
+Run = tuple[int, str, str]  # exit status, standard output, standard error
+
+
+@pytest.fixture
+def caneflow(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Run]:
+    """The command, run in this process."""
+
+    def run(*arguments: object) -> Run:
+        monkeypatch.setattr(sys, "argv", ["caneflow", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            command.main()
+        said = capsys.readouterr()
+        return int(end.value.code or 0), said.out, said.err
+
+    return run
+
+
+def test_programs_pass_their_own_tests_and_make_a_flow(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    lines = []
+    for kind, name in (("driver", "my_gyro"), ("operator", "smooth")):
+        status, out, err = caneflow("new", kind, name, "--folder", tmp_path)
+        assert (status, err) == (0, "")
+        assert out.startswith(f"{tmp_path / name}.py: edit it; ")
+        lines.append(out.splitlines()[-1].replace("imu/imu", "my_gyro/imu"))
+    file = tmp_path / "mine.yaml"
+    file.write_text("\n".join(["flow: mine", "nodes:", *lines, "results: [smooth/imu]", ""]))
+    graph, problems = examine(file)
+    assert graph is not None, problems
+    assert not problems
+    assert [node.program.__name__ for node in graph.nodes.values() if node.program] == ["MyGyro", "Smooth"]
+    for check in (
+        ["-m", "pytest", "-q", "-p", "no:cacheprovider", "."],
+        ["-m", "ruff", "check", "--line-length", "120", "--select", "B,E,F,UP", "."],
+    ):
+        done = subprocess.run(
+            [sys.executable, *check], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_what_is_there_is_not_written_over(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    mine = tmp_path / "test_smooth.py"
+    mine.write_text("mine")
+    said = f"caneflow new: {mine}: is there already; give another name, or remove it\n"
+    assert caneflow("new", "operator", "smooth", "--folder", tmp_path) == (2, "", said)
+    assert [path.name for path in tmp_path.iterdir()] == ["test_smooth.py"]
+
+
+@pytest.mark.parametrize("name", ["Smooth", "9x", "a-b", "../x", "a.b"])
+def test_a_name_that_is_no_nodes_is_refused(caneflow: Callable[..., Run], tmp_path: Path, name: str) -> None:
+    status, out, err = caneflow("new", "driver", name, "--folder", tmp_path)
+    assert (status, out) == (2, "")
+    assert err.startswith(f"caneflow new: {name!r} is no name for a node: ")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,226 @@
+"""`caneflow new`: a program of your own that works, with its test and its line in dataflow.yaml."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caneflow.errors import CaneflowError
+from caneflow.messages import NAME, NAME_RULE
+
+OPERATOR = '''"""Smoothed rotation: an IMU's samples with a low-pass filter over the gyro.
+
+in   imu : Imu
+out  imu : Imu   one per sample, gyro smoothed
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+from annotated_types import Gt
+
+from caneflow.messages import Imu, Sample
+from caneflow.runtime import Context, Emitted, Operator
+from caneflow.runtime.node import run
+
+
+@dataclass(frozen=True, kw_only=True)
+class CLASSSettings:
+    """What dataflow.yaml may set."""
+
+    time_constant: Annotated[float, Gt(0)] = 0.1  # s
+
+
+class CLASS(Operator):
+    """Owns no socket, thread or clock: time is the message's stamp."""
+
+    inputs = {"imu": Imu}
+    outputs = {"imu": Imu}
+    Settings = CLASSSettings
+
+    def __init__(self, settings: CLASSSettings, context: Context) -> None:
+        self._settings = settings
+        self._last: Imu | None = None  # as it was sent
+
+    def handle(self, port: str, message: Sample) -> Emitted:
+        """Yield the sample with its gyro smoothed; the first one is as it came."""
+        assert isinstance(message, Imu)
+        if self._last is not None:
+            elapsed = (message.stamp - self._last.stamp) / 1e9  # s
+            share = 1 - math.exp(-elapsed / self._settings.time_constant)
+            x, y, z = (old + share * (new - old) for old, new in zip(self._last.gyro, message.gyro, strict=True))
+            message = msgspec.structs.replace(message, gyro=(x, y, z))
+        self._last = message
+        yield "imu", message
+
+
+if __name__ == "__main__":
+    run(CLASS)
+'''
+
+OPERATOR_TEST = '''"""A list of messages in, a list out: no process, no clock."""
+
+import numpy as np
+import pytest
+
+from caneflow.messages import Imu
+from caneflow.messages.rig import read_rig
+from caneflow.runtime import Context
+
+from NAME import CLASS, CLASSSettings
+
+STEP = 10_000_000  # ns: 100 Hz
+
+
+def operator(time_constant: float) -> CLASS:
+    context = Context(node="NAME", rig=read_rig({}), ports={"imu": Imu}, random=np.random.default_rng(0))
+    return CLASS(CLASSSettings(time_constant=time_constant), context)
+
+
+def test_a_step_is_reached_to_63_percent_after_the_time_constant() -> None:
+    smooth = operator(time_constant=0.1)
+    turning = [Imu(stamp=seq * STEP, gyro=(0.0, 0.0, float(seq > 0))) for seq in range(11)]
+
+    out = [message for sample in turning for _, message in smooth.handle("imu", sample)]
+
+    assert [message.stamp for message in out] == [sample.stamp for sample in turning]
+    assert isinstance(out[-1], Imu)
+    assert out[-1].gyro[2] == pytest.approx(1 - np.exp(-1))  # 0.1 s after the step
+'''
+
+DRIVER = '''"""A gyro that turns to and fro: the place to read your own device.
+
+out  imu : Imu   `rate` per second
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Gt
+
+from caneflow.messages import Imu
+from caneflow.runtime import Brought, Context, Source
+from caneflow.runtime.node import run
+
+
+@dataclass(frozen=True, kw_only=True)
+class CLASSSettings:
+    """What dataflow.yaml may set."""
+
+    rate: Annotated[float, Gt(0)] = 100.0  # Hz
+    amplitude: float = 1.0  # rad/s
+    period: Annotated[float, Gt(0)] = 1.0  # s
+
+
+def reading(stamp: int, settings: CLASSSettings) -> Imu:
+    """What the device measured at `stamp` (ns); pure, so that it is tested without the device."""
+    turn = settings.amplitude * math.sin(2 * math.pi * stamp / 1e9 / settings.period)
+    return Imu(stamp=stamp, gyro=(0.0, 0.0, turn))
+
+
+def ticks(rate: float, now: Callable[[], float], sleep: Callable[[float], None]) -> Iterator[None]:
+    """One tick per 1/`rate` s, counted from one start so that errors do not add up."""
+    start, number = now(), 0
+    while True:
+        number += 1
+        sleep(max(0.0, start + number / rate - now()))
+        yield
+
+
+class CLASS(Source):
+    """The one kind of program that may read the clock: here a stamp is born."""
+
+    outputs = {"imu": Imu}
+    Settings = CLASSSettings
+
+    def __init__(self, settings: CLASSSettings, context: Context) -> None:
+        self._settings = settings
+
+    def samples(self) -> Brought:
+        """Yield samples as they are measured. Close the device in a `finally`: the flow may end at any yield."""
+        for _ in ticks(self._settings.rate, time.monotonic, time.sleep):
+            yield "imu", reading(time.time_ns(), self._settings)
+
+
+if __name__ == "__main__":
+    run(CLASS)
+'''
+
+DRIVER_TEST = '''"""The device's readings and the driver's pace, without a device and without waiting."""
+
+import itertools
+
+import pytest
+
+from NAME import CLASSSettings, reading, ticks
+
+
+def test_a_quarter_of_a_period_is_the_greatest_turn() -> None:
+    settings = CLASSSettings(amplitude=2.0, period=4.0)
+    assert reading(1_000_000_000, settings).gyro == pytest.approx((0.0, 0.0, 2.0))
+
+
+def test_ticks_keep_their_rate_whatever_a_reading_takes() -> None:
+    clock = [0.0]
+
+    def sleep(seconds: float) -> None:
+        clock[0] += seconds
+
+    at = []
+    for _ in itertools.islice(ticks(100.0, lambda: clock[0], sleep), 50):
+        at.append(clock[0])
+        clock[0] += 0.004  # s that a reading takes
+    assert at == pytest.approx([(number + 1) / 100 for number in range(50)])
+'''
+
+
+def operator(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the file and of the node, e.g. smooth.")],
+    folder: Annotated[Path, typer.Option("--folder", metavar="DIR", help="Where to put the files.")] = Path(),
+) -> None:
+    """Write NAME.py, an operator that works, and test_NAME.py; print its line for dataflow.yaml.
+
+    An operator turns messages into messages. This one smooths an IMU's gyro, time constant in s; put your own in.
+
+    Example: caneflow new operator smooth
+    """
+    line = f"  {name}: {{run: ./{name}.py, inputs: {{imu: imu/imu}}, settings: {{time_constant: 0.1}}}}"
+    _write(name, folder, OPERATOR, OPERATOR_TEST, line)
+
+
+def driver(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the file and of the node, e.g. my_gyro.")],
+    folder: Annotated[Path, typer.Option("--folder", metavar="DIR", help="Where to put the files.")] = Path(),
+) -> None:
+    """Write NAME.py, a driver that works, and test_NAME.py; print its line for dataflow.yaml.
+
+    A driver brings samples in. This one makes up a gyro that turns to and fro (rate in Hz, amplitude in rad/s, period
+    in s); put your device there.
+
+    Example: caneflow new driver my_gyro
+    """
+    _write(name, folder, DRIVER, DRIVER_TEST, f"  {name}: {{run: ./{name}.py, settings: {{rate: 100}}}}")
+
+
+commands = {"operator": operator, "driver": driver}
+
+
+def _write(name: str, folder: Path, program: str, test: str, line: str) -> None:
+    if not NAME.fullmatch(name):
+        raise CaneflowError(f"{name!r} is no name for a node: {NAME_RULE}")
+    files = {folder / f"{name}.py": program, folder / f"test_{name}.py": test}
+    for path in files:
+        if path.exists():
+            raise CaneflowError(f"{path}: is there already; give another name, or remove it")
+    class_name = "".join(part.capitalize() for part in name.split("_"))
+    for path, text in files.items():
+        path.write_text(text.replace("CLASS", class_name).replace("NAME", name), encoding="utf-8")
+    program_path, test_path = files
+    print(f"{program_path}: edit it; `pytest {test_path}` tests it without any process")
+    print("into dataflow.yaml, under nodes:")
+    print(line)
