@@ -96,7 +96,12 @@ def run_with_a_kill(launch: Launch, file: Path, walk: Path, out: Path, speed: st
         time.sleep(SETTLED)  # what it had sent has come
         if watched.seq == SAMPLES - 1:
             return None
-        watched.wait_for(watched.seq + 1)
+        reached = watched.seq
+        wait_for(
+            lambda: watched.seq > reached or launched.process.poll() is not None,
+            f"more than seq {reached}: {launched.said}",
+            deadline=60.0,
+        )
         recovered = time.monotonic() - killed
     assert launched.ends() == 0, launched.said
     assert f"{node} | ended with killed by SIGKILL; restart 1 of" in launched.said

@@ -19,7 +19,7 @@ import pytest
 
 from caneflow.recording import Recording
 from caneflow.runtime.hosts.run_directory import running_flows
-from tests.flows import CANEFLOW, NODES, Launched, launchers, spread_cane, wait_for, write_walk
+from tests.flows import CANEFLOW, NODES, Launched, launchers, results, spread_cane, wait_for, write_walk
 
 Launch = Callable[..., Launched]
 
@@ -120,9 +120,14 @@ def test_random_kills_and_freezes_lose_nothing_and_leave_nothing(launch: Launch,
         for stream in recording.streams:
             seqs = [sample.seq for sample in recording.samples([stream])]
             assert seqs == list(range(len(seqs))), stream
-    verify = [*CANEFLOW, "verify", str(file), str(out)]
-    verified = subprocess.run(verify, capture_output=True, text=True, check=False)
-    assert verified.returncode == 0, verified.stdout + verified.stderr
+    # Ctrl-C cuts the operators off somewhere; up to there they gave what an undisturbed run of the same inputs gives.
+    again = tmp_path / "again.mcap"
+    run = [*CANEFLOW, "run", str(file), "--replay", str(out), "--in-process", "--record", str(again)]
+    subprocess.run(run, capture_output=True, check=True)
+    expected = results(again)
+    for name, payloads in results(out).items():
+        assert payloads == expected[name][: len(payloads)], name
+        assert len(expected[name]) - len(payloads) < 600, "no further behind than the window of a replay"
     for name, (descriptors, memory) in slopes.items():
         assert descriptors < 1, f"{name}: {descriptors:.2f} more descriptors a minute"
         assert memory < 2, f"{name}: {memory:.2f} MiB more a minute"
