@@ -187,7 +187,7 @@ def test_an_operator_that_breaks_fails_its_recording_only(walks: list[Path], mon
 
 
 def test_a_method_that_is_not_offered_is_named_in_one_line() -> None:
-    said = f"no method 'kalmann'; did you mean 'kalman'? fusion offers {', '.join(METHODS)}"
+    said = f"no method 'kalmann'; did you mean 'kalman'? fusion offers {', '.join(METHODS)}, smoothed"
     with pytest.raises(DataflowError, match=f"^{re.escape(said)}$"):
         chosen_methods(load(FLOW), ["luenberger", "kalmann"])
 

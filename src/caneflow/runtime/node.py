@@ -350,8 +350,8 @@ class _OperatorNode(_ReaderNode):
         for note in self.stage.left_out():
             self.bus.send_left_out(note)
         self.keep_snapshot()
-        progress = self.progress()
         if self.stage.finished or self.stage.tells_more_than_samples() or self.reports.due():
+            progress = self.progress()
             if self.stage.finished:
                 self.count(self.sent(), at_once=progress != self.reports.said)
             self.reports.progress(progress)
