@@ -23,7 +23,7 @@ run: $(BIN)/.installed $(WALK)
 	@echo "the paper's mean final error over ten walks: 1.3 m; the picture: build/track.png"
 
 test: $(BIN)/.installed
-	$(BIN)/pytest --numprocesses 2
+	$(BIN)/pytest --numprocesses 3
 
 lint: $(BIN)/.installed
 	$(BIN)/ruff check

@@ -23,7 +23,8 @@ from caneflow.runtime.hosts.run_directory import running_flows
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
-DEADLINE = 30.0  # s for anything that is waited for
+DEADLINE = 60.0  # s for anything that is waited for
+LONG = pytest.mark.long
 
 CANE = """
 flow: {flow}
@@ -228,6 +229,7 @@ def counters(session: zenoh.Session, flow: str, node: str) -> "Iterator[Counters
                 time.sleep(0.02)
             else:
                 yield decode(sample.payload.to_bytes(), Counters)
+    pytest.fail(f"{node} did not count up to what was waited for in {DEADLINE:g} s")
 
 
 def test_every_host_and_speed_gives_the_same_bytes(cane: Path, walk: Path, tmp_path: Path) -> None:
@@ -312,16 +314,18 @@ def test_a_killed_launcher_leaves_no_process(live: Path, start: Callable[..., Ru
     wait_for(lambda: not running.nodes(), "the end of all nodes", deadline=5.0)
 
 
-def test_a_killed_node_comes_back_and_the_gap_is_counted(live: Path, start: Callable[..., Running]) -> None:
+def test_a_killed_node_of_a_live_run_comes_back_and_misses_nothing(live: Path, start: Callable[..., Running]) -> None:
     running = start("run", live)
     with running.session() as session:
         before = next(counters(session, running.flow, "echo"))
-        assert before.inputs["imu"].lost == 0, "the start barrier holds"
         victim = running.node("echo")
         victim.kill()
-        for counted in counters(session, running.flow, "echo"):
-            if counted.inputs["imu"].lost and counted.outputs["imu"] > 50:
-                break  # the new process hears and speaks; what it missed has a number
+        after = next(
+            counted
+            for counted in counters(session, running.flow, "echo")
+            if counted.outputs["imu"] > before.outputs["imu"] + 100  # 1 s
+        )
+    assert after.inputs["imu"].lost == 0, "its writer keeps what has not been confirmed"
     assert running.node("echo").pid != victim.pid
     status, output = running.end(signal.SIGINT)
     assert status == 130
@@ -548,7 +552,9 @@ def test_verify_names_the_first_difference(cane: Path, walk: Path, tmp_path: Pat
     assert "holds no output of" in done.stderr
 
 
-@pytest.mark.parametrize("victim", ["ground_speed", "fusion", "imu"])
+@pytest.mark.parametrize(
+    "victim", [pytest.param("ground_speed", marks=LONG), "fusion", pytest.param("imu", marks=LONG)]
+)
 def test_a_killed_node_goes_on_as_if_nothing_had_happened(
     cane: Path, walk: Path, tmp_path: Path, start: Callable[..., Running], victim: str
 ) -> None:

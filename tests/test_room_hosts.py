@@ -33,7 +33,7 @@ def poses(walk: Path, out: Path, method: str, *options: str) -> list[bytes]:
         return [sample.payload for sample in got.samples([POSES])]
 
 
-@pytest.mark.parametrize("method", ["particle", "best"])
+@pytest.mark.parametrize("method", ["particle", pytest.param("best", marks=pytest.mark.long)])
 def test_processes_give_the_same_bytes_as_one_process(walk: Path, tmp_path: Path, method: str) -> None:
     alone = poses(walk, tmp_path / "alone.mcap", method, "--in-process")
     assert len(alone) > 100

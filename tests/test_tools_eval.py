@@ -268,6 +268,7 @@ def test_another_programs_database_is_left_alone(tmp_path: Path) -> None:
         ResultsFile(path, load(FLOW), ["luenberger"])
 
 
+@pytest.mark.long
 def test_a_cluster_gives_the_same_figures(walks: list[Path]) -> None:
     distributed = pytest.importorskip("distributed", reason="Dask is not installed (the extra `cluster`)")
     alone = caneflow("eval", *walks, "--methods", "luenberger", "--json")
