@@ -60,7 +60,7 @@ def boresight(poses: list[Any], rig: dict[str, Any]) -> np.ndarray:
     return np.asarray(axes / np.linalg.norm(axes, axis=1)[:, None])
 
 
-@pytest.mark.parametrize(("name", "final"), [("swing_1", 1.0), ("hard_4", 1.5)])
+@pytest.mark.parametrize(("name", "final"), [("swing_1", 1.0), pytest.param("hard_4", 1.5, marks=pytest.mark.long)])
 def test_recorded_walks(name: str, final: float) -> None:
     """Against the truth's velocity along the boresight, weighed over the window as the spectrum weighs it."""
     streams, rig = walk(name)

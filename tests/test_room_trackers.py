@@ -167,6 +167,7 @@ def test_without_a_guess_the_person_is_found_anywhere_in_the_area() -> None:
     assert errors[400:].mean() < 1.0
 
 
+@pytest.mark.long
 def test_everything_together_is_better_than_a_part_of_it() -> None:
     """The paper's Fig. 6, and its reason for fusing; means of three seeds."""
 

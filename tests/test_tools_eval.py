@@ -115,6 +115,7 @@ def test_methods_that_run_side_by_side_give_what_each_gives_alone(walks: list[Pa
         assert (alone[method].track.positions == together[method].track.positions).all(), method
 
 
+@pytest.mark.long
 def test_several_processes_give_what_one_gives(walks: list[Path]) -> None:
     one = list(evaluated(FLOW, walks, ["kalman"]))
     two = list(evaluated(FLOW, walks, ["kalman"], jobs=2))
