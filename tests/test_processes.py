@@ -10,16 +10,16 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import psutil
 import pytest
 import zenoh
 
-from caneflow.messages import Imu, RadarFrame, control_key, decode, numbered, sample_key
+from caneflow.messages import Imu, control_key, decode, numbered, sample_key
 from caneflow.messages.control import Counters
-from caneflow.recording import Recording, RecordingWriter
+from caneflow.recording import Recording
 from caneflow.runtime.hosts.links import open_session
 from caneflow.runtime.hosts.run_directory import running_flows
+from tests.flows import write_walk
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -90,27 +90,7 @@ results: [echo/imu]
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """4 s of IMU samples and radar frames of noise: the graph runs on it, whatever it makes of it."""
-    path = tmp_path_factory.mktemp("walk") / "walk.mcap"
-    rng = np.random.default_rng(3)
-    rig = {"boresight": [0, 1, 0], "hand_height": 0.95, "aperture": 0.87, "pivot": [0, -0.3, 0]}
-    with RecordingWriter(path, flow="elsewhere", source="simulated", rig=rig) as writer:
-        for seq in range(400):
-            stamp = 1_000_000_000 + seq * 10_000_000
-            gyro, accel = rng.normal(size=(2, 3)).tolist()
-            imu = Imu(stamp=stamp, gyro=gyro, linear_accel=accel, orientation=(0.94, -0.342, 0.0, 0.0))
-            frame = RadarFrame(
-                stamp=stamp,
-                scans=rng.integers(-999, 999, size=(1, 96), dtype=np.int32),
-                scan_period=0.01,
-                range_start=0.5,
-                range_step=0.009149,
-                carrier=4.3e9,
-                bandwidth=1.7e9,
-            )
-            for node, port, message in (("imu", "imu", imu), ("radar", "frame", frame)):
-                key = sample_key("elsewhere", node, port)
-                writer.write(key, type(message), numbered(message, seq), stamp=stamp, seq=seq, log_time=stamp)
-    return path
+    return write_walk(tmp_path_factory.mktemp("walk") / "walk.mcap")
 
 
 @pytest.fixture
