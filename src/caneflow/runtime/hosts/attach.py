@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from caneflow.runtime.hosts.certificates import Credentials
 
 ANSWER_TIMEOUT = 2.0  # s that a launcher has to answer; it takes some ms
+ASK_AGAIN = 0.1  # s: what a launcher declares may come a moment after the link to it
 WRITE_TIMEOUT = 30.0  # s that a sink has to answer: it may have to write much first
 ANY = "*"
 DEFAULT_KEYS = Path("keys")  # the folder with an observer's certificate
@@ -48,7 +49,9 @@ class Attached:
 
         Raises DataflowError when none answers.
         """
-        answers = statuses(self.session, self.flow)
+        deadline = time.monotonic() + ANSWER_TIMEOUT
+        while not (answers := statuses(self.session, self.flow)) and time.monotonic() < deadline:
+            time.sleep(ASK_AGAIN)  # where nobody is known to answer, Zenoh says so at once
         if not answers:
             raise DataflowError(f"{self.flow} does not answer; it may be ending: try again, or `caneflow doctor`")
         return merged(answers)

@@ -153,11 +153,11 @@ class Launcher:
             endpoint = ports.endpoint()
             with (
                 self._open_session(endpoint) as self._session,
+                self._subscribed(),
                 RunDirectory(self._deployment.flow, endpoint) as self._directory,  # tools may attach from here on
                 Processes(self._events, self._directory.path) as self._processes,
                 self._signals(),
             ):
-                self._subscribe()
                 if self._gather():
                     self._take_nodes(linked(self._deployment, ports, endpoint))
                     for node in self._nodes.values():
@@ -274,9 +274,11 @@ class Launcher:
 
     # --- what comes -------------------------------------------------------------------------------------------
 
-    def _subscribe(self) -> None:
+    @contextmanager
+    def _subscribed(self) -> Iterator[None]:
+        """Hear the nodes, and answer whoever asks, before anybody can know of this run."""
         flow = self._deployment.flow
-        self._held: list[object] = [
+        held: list[object] = [
             self._session.declare_subscriber(control_key(flow, "counters", "*"), self._hearing(Counters)),
             self._session.liveliness().declare_subscriber(
                 control_key(flow, "ready", "*"),
@@ -290,7 +292,9 @@ class Launcher:
         ]
         if self._leads:
             key = control_key(flow, "progress", "*")
-            self._held.append(self._session.declare_subscriber(key, self._hearing(Progress)))
+            held.append(self._session.declare_subscriber(key, self._hearing(Progress)))
+        yield
+        held.clear()  # they end with the session
 
     def _hearing(self, kind: type[Progress] | type[Counters]) -> "zenoh.handlers.Callback[zenoh.Sample]":
         def put(sample: zenoh.Sample) -> None:
