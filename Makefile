@@ -5,6 +5,9 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 WALK := build/walk.mcap
 
+# Flows are started by the hundred: each process would compile every module anew where this is set.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: run test lint docs soak bench mcu-test clean
 
 # The environment is made once, and again when the project's needs change.

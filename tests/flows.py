@@ -1,6 +1,7 @@
 """A cane that is spread over machines, a recording for it, and launchers to run it with: for several test files."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from caneflow.messages import Imu, RadarFrame, numbered, sample_key
 from caneflow.recording import Recording, RecordingWriter
@@ -52,6 +54,19 @@ def write_walk(path: Path, samples: int = 400) -> Path:
                 key = sample_key("elsewhere", node, port)
                 writer.write(key, type(message), numbered(message, seq), stamp=stamp, seq=seq, log_time=stamp)
     return path
+
+
+def node_processes(launcher: int) -> dict[str, psutil.Process]:
+    """The processes of a run's nodes by name: each is called by its plan, which is in the run's own folder."""
+    found = {}
+    for process in psutil.process_iter():
+        try:
+            named = re.search(rf"-{launcher}/(\w+)\.json", " ".join(process.cmdline()))
+            if named and process.status() != psutil.STATUS_ZOMBIE:
+                found[named[1]] = process
+        except psutil.Error:
+            continue
+    return found
 
 
 def results(path: Path) -> dict[str, list[bytes]]:

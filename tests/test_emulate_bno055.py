@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from caneflow.messages import Imu, numbered, sample_key
 from caneflow.protocols.bno055 import ACCEL_STEP, GYRO_STEP, MAG_STEP, QUATERNION_STEP
 from caneflow.recording import Recording, RecordingWriter
+from tests.flows import node_processes
 from tools.emulate import bno055
 
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -106,8 +107,8 @@ def driver_of(launcher: int) -> psutil.Process:
     found: list[psutil.Process] = []
 
     def there() -> bool:
-        children = psutil.Process(launcher).children()
-        found.extend(child for child in children if "caneflow.drivers.bno055" in child.cmdline())
+        nodes = node_processes(launcher).values()
+        found.extend(node for node in nodes if "caneflow.drivers.bno055" in " ".join(node.cmdline()))
         return bool(found)
 
     wait_for(there, "the driver")

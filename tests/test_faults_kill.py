@@ -7,14 +7,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 import zenoh
 
 from caneflow.messages import GroundSpeed, Pose, Sample, decode, sample_key
 from caneflow.runtime.hosts.links import open_session
 from caneflow.runtime.hosts.run_directory import RunningFlow, running_flows
-from tests.flows import NODES, Launched, launchers, results, spread_cane, wait_for, write_walk
+from tests.flows import NODES, Launched, launchers, node_processes, results, spread_cane, wait_for, write_walk
 
 Launch = Callable[..., Launched]
 
@@ -65,17 +64,6 @@ def running(launched: Launched) -> RunningFlow:
     return found()[0]
 
 
-def process_of(flow: RunningFlow, node: str) -> psutil.Process | None:
-    """The process of a node, by the plan on its command line; None when it has ended."""
-    plan = f"{flow.flow}-{flow.pid}/{node}.json"
-    found = (
-        process
-        for process in psutil.process_iter(["cmdline"])
-        if any(word.endswith(plan) for word in process.info["cmdline"] or ())
-    )
-    return next(found, None)
-
-
 def run_with_a_kill(launch: Launch, file: Path, walk: Path, out: Path, speed: str, node: str, at: int) -> float | None:
     """Replay `walk` and kill `node` once its output has come to seq `at`; s until it has gone on.
 
@@ -87,7 +75,7 @@ def run_with_a_kill(launch: Launch, file: Path, walk: Path, out: Path, speed: st
     with open_session(mode="client", connect=[flow.endpoint]) as session:
         watched = Watched(session, flow.flow, node)
         watched.wait_for(at)
-        victim = process_of(flow, node)
+        victim = node_processes(flow.pid).get(node)
         if victim is None:
             return None
         victim.kill()

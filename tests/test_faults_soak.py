@@ -19,7 +19,7 @@ import pytest
 
 from caneflow.recording import Recording
 from caneflow.runtime.hosts.run_directory import running_flows
-from tests.flows import CANEFLOW, NODES, Launched, launchers, results, spread_cane, wait_for, write_walk
+from tests.flows import CANEFLOW, NODES, Launched, launchers, node_processes, results, spread_cane, wait_for, write_walk
 
 Launch = Callable[..., Launched]
 
@@ -38,16 +38,6 @@ KEEP_TRYING = "restart: {max_restarts: 1000, delay_s: 0.1, max_delay_s: 0.1}"
 def launch() -> Iterator[Launch]:
     with launchers() as launch:
         yield launch
-
-
-def processes_of(folder: str) -> dict[str, psutil.Process]:
-    """The processes whose plan is in the run's folder, by node."""
-    found = {}
-    for process in psutil.process_iter(["cmdline"]):
-        plan = (process.info["cmdline"] or [""])[-1]
-        if folder in plan and plan.endswith(".json"):
-            found[Path(plan).stem] = process
-    return found
 
 
 class Growth:
@@ -80,18 +70,20 @@ def test_random_kills_and_freezes_lose_nothing_and_leave_nothing(launch: Launch,
     text = spread_cane(flow, "  here: {}\n", dict.fromkeys(NODES, "here"))
     file.write_text(text.replace("machine: here}", f"machine: here, {KEEP_TRYING}}}"))
     launched = launch("run", file, "--replay", walk, "--loop", "--record", out, log=tmp_path / "run.log")
-    folder = f"{flow}-{launched.process.pid}/"
-    wait_for(lambda: len(processes_of(folder)) == len(NODES) + 1, "all nodes")
+    wait_for(lambda: len(node_processes(launched.process.pid)) == len(NODES) + 1, "all nodes")
     wait_for(lambda: any(each.pid == launched.process.pid for each in running_flows()), "the flow's address")
     chance, done = np.random.default_rng(int(MINUTES * 10)), Counter[str]()
-    lasting = {"launcher": psutil.Process(launched.process.pid), "recorder": processes_of(folder)["recorder"]}
+    lasting = {
+        "launcher": psutil.Process(launched.process.pid),
+        "recorder": node_processes(launched.process.pid)["recorder"],
+    }
     growth, end = Growth(lasting), time.monotonic() + 60 * MINUTES
 
     while time.monotonic() < end:
         assert launched.process.poll() is None, launched.said
         growth.look()
         time.sleep(chance.uniform(*PAUSE))
-        running = {name: each for name, each in processes_of(folder).items() if name in NODES}
+        running = {name: each for name, each in node_processes(launched.process.pid).items() if name in NODES}
         if not running:
             continue
         victim = running[str(chance.choice(sorted(running)))]
@@ -106,7 +98,7 @@ def test_random_kills_and_freezes_lose_nothing_and_leave_nothing(launch: Launch,
                 done["frozen"] += 1
         except psutil.NoSuchProcess:
             continue  # it was just being started anew
-    wait_for(lambda: len(processes_of(folder)) == len(NODES) + 1, "all nodes to be back")
+    wait_for(lambda: len(node_processes(launched.process.pid)) == len(NODES) + 1, "all nodes to be back")
     launched.process.send_signal(signal.SIGINT)
     status = launched.ends()
     slopes = growth.per_minute()
@@ -114,7 +106,7 @@ def test_random_kills_and_freezes_lose_nothing_and_leave_nothing(launch: Launch,
     log.info("first and last look (min, descriptors, MiB, ...): %s", growth.ends())
 
     assert status == 130, launched.said
-    assert not processes_of(folder), "left behind"
+    assert not node_processes(launched.process.pid), "left behind"
     with Recording(out) as recording:
         assert recording.complete
         for stream in recording.streams:

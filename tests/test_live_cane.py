@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import psutil
 import pytest
 from numpy.typing import NDArray
 
 from caneflow.messages import Imu, Pose, RadarFrame, Sample, numbered, sample_key
 from caneflow.protocols.bno055 import ACCEL_STEP, GYRO_STEP, QUATERNION_STEP
 from caneflow.recording import Recording, RecordingWriter
+from tests.flows import node_processes
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -216,10 +216,10 @@ def live(
 def _cpu_times(launcher: int) -> dict[str, float]:
     """Processor time (s) of each driver."""
     times = {}
-    for child in psutil.Process(launcher).children():
-        found = re.search(r"caneflow\.drivers\.(\w+)", " ".join(child.cmdline()))
+    for node in node_processes(launcher).values():
+        found = re.search(r"caneflow\.drivers\.(\w+)", " ".join(node.cmdline()))
         if found:
-            times[found[1]] = sum(child.cpu_times()[:2])
+            times[found[1]] = sum(node.cpu_times()[:2])
     return times
 
 

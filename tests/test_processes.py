@@ -19,7 +19,7 @@ from caneflow.messages.control import Counters
 from caneflow.recording import Recording
 from caneflow.runtime.hosts.links import open_session
 from caneflow.runtime.hosts.run_directory import running_flows
-from tests.flows import write_walk
+from tests.flows import node_processes, write_walk
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -135,11 +135,11 @@ class Running:
         return self.process.returncode, output
 
     def nodes(self) -> list[psutil.Process]:
-        """The processes of the flow's nodes, the launcher and its guard left out."""
-        return processes_with(f"{self.flow}-{self.process.pid}/")
+        """The processes of the flow's nodes."""
+        return list(node_processes(self.process.pid).values())
 
     def node(self, name: str) -> psutil.Process:
-        return next(process for process in self.nodes() if process.cmdline()[-1].endswith(f"/{name}.json"))
+        return node_processes(self.process.pid)[name]
 
     def session(self) -> zenoh.Session:
         """A client of the flow, as the tools are."""
@@ -176,17 +176,6 @@ def wait_for(condition: Callable[[], object], what: str, deadline: float = DEADL
     while not condition():
         assert time.monotonic() < end, f"waited {deadline} s for {what}"
         time.sleep(0.02)
-
-
-def processes_with(text: str) -> list[psutil.Process]:
-    found = []
-    for process in psutil.process_iter():
-        try:
-            if text in " ".join(process.cmdline()) and process.status() != psutil.STATUS_ZOMBIE:
-                found.append(process)
-        except psutil.Error:
-            continue
-    return found
 
 
 def results(path: Path) -> dict[str, list[bytes]]:
@@ -336,8 +325,9 @@ def test_a_node_that_hangs_before_it_is_ready_is_named(
     )
     done = caneflow("run", live)
     assert done.returncode == 1
-    assert re.search(r"echo not ready after 2 s", done.stderr)
-    assert not processes_with(str(tmp_path / "echo.py"))
+    pid = re.search(r"echo not ready after 2 s \(pid (\d+) killed\)", done.stderr)
+    assert pid
+    assert not psutil.pid_exists(int(pid[1]))
 
 
 def test_a_missing_program_is_found_before_anything_starts(live: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from caneflow.runtime.deployment import Deployment, Replay, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.hosts.launch import Launcher, Outcome
+from caneflow.runtime.hosts.nursery import Nursery
 from caneflow.runtime.wording import listed
 
 
@@ -73,6 +74,7 @@ def command(
 
     Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record out.mcap --set fusion.method=kalman
     """
+    nursery = None if in_process else Nursery()  # first: what is there now is there in every node
     graph = load(file, settings or ())
     for warning in graph.warnings:
         print(warning, file=sys.stderr)
@@ -89,12 +91,12 @@ def command(
         machine=None if in_process else machine,
     )
     started = time.monotonic()
-    if in_process:
+    if nursery is None:
         programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
         outcome = InProcess(deployment, programs).run()
     else:
         restarts = {name: node.restart for name, node in graph.nodes.items()}
-        outcome = Launcher(deployment, restarts, report, keys or file.parent / "keys").run()
+        outcome = Launcher(deployment, restarts, report, nursery, keys or file.parent / "keys").run()
     summary(deployment, outcome, time.monotonic() - started)
     raise typer.Exit(outcome.status)
 

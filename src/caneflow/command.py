@@ -1,5 +1,6 @@
 """The door of the `caneflow` command: finds the tool for a word, and turns an expected error into one line."""
 
+import os
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -18,6 +19,9 @@ USAGE_STATUS = 2  # exit status of an expected error, as of a misspelt option
 # UsageError, which typer does not name: of click, or of its own copy of click.
 MISUSE = cast(type[Exception], typer.BadParameter.__mro__[1])
 INTERRUPTED_STATUS = 130  # 128 + SIGINT, as a shell reports Ctrl-C
+
+# One thread for linear algebra in each process: a flow is parallel already, and sums must not depend on cores.
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 # Word -> module in tools, one line of help. A tool has `command`, a function whose annotations are its options, or
 # `commands`, such functions by word. It is imported when its word is used: `caneflow check` needs no matplotlib.
@@ -75,6 +79,8 @@ class Door(TyperGroup):
 
 def main() -> NoReturn:
     """Run the command line's word; exit status 2 and one line for an expected error, a traceback for a bug."""
+    for variable in ONE_THREAD:  # before numpy is imported
+        os.environ.setdefault(variable, "1")
     try:
         status = _command().main(prog_name="caneflow", standalone_mode=False)
     except MISUSE as error:

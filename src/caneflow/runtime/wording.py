@@ -4,11 +4,14 @@ import json
 import re
 from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
+from itertools import islice
 from typing import TypeAlias
 
 KeyPath: TypeAlias = tuple[str | int, ...]  # the way to a value: keys of mappings, numbers in lists
 
 LONGEST = 60  # characters of a value that are worth a look
+MOST_NAMES = 200  # that are compared with a misspelt one: a hostile file has thousands of both
+MOST_LISTED = 50
 PLAIN_KEY = re.compile(r"[\w*<-]+")
 
 
@@ -29,8 +32,9 @@ def one_line(text: object) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """`names` as a list to read, or the word for none."""
-    return ", ".join(names) or "none"
+    """`names` as a list to read, or the word for none; of very many only the first."""
+    first = list(islice(names, MOST_LISTED + 1))
+    return ", ".join([*first[:MOST_LISTED], *(["..."] if len(first) > MOST_LISTED else [])]) or "none"
 
 
 def in_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:
@@ -45,5 +49,5 @@ def in_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> li
 
 def did_you_mean(word: str, names: Iterable[str], *, likeness: float = 0.6) -> str:
     """` did you mean 'x'?` for the closest of `names`, or nothing when none is as close as `likeness` (0..1)."""
-    close = get_close_matches(word, list(names), n=1, cutoff=likeness)
+    close = get_close_matches(word[:LONGEST], list(islice(names, MOST_NAMES)), n=1, cutoff=likeness)
     return f" did you mean {close[0]!r}?" if close else ""

@@ -34,8 +34,9 @@ from caneflow.runtime.hosts.machines import (
     Left,
     Word,
 )
+from caneflow.runtime.hosts.nursery import Nursery
 from caneflow.runtime.hosts.observations import Observations
-from caneflow.runtime.hosts.processes import Exited, Line, Processes
+from caneflow.runtime.hosts.processes import Exited, Line, NurseryLost, Processes
 from caneflow.runtime.hosts.run_directory import RunDirectory, remove_state_folder, state_folder
 from caneflow.runtime.hosts.security import links_between
 from caneflow.runtime.plan import NodePlan
@@ -123,9 +124,15 @@ class Launcher:
     """One run of a deployment."""
 
     def __init__(
-        self, deployment: Deployment, restarts: dict[str, Restart], report: Report, keys: Path | None = None
+        self,
+        deployment: Deployment,
+        restarts: dict[str, Restart],
+        report: Report,
+        nursery: Nursery,
+        keys: Path | None = None,
     ) -> None:
         """`keys`: the folder with this machine's certificate, where the flow has several machines."""
+        self._nursery = nursery
         self._keys = keys
         self._events: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._restarts = restarts
@@ -155,7 +162,7 @@ class Launcher:
                 self._open_session(endpoint) as self._session,
                 self._subscribed(),
                 RunDirectory(self._deployment.flow, endpoint) as self._directory,  # tools may attach from here on
-                Processes(self._events, self._directory.path) as self._processes,
+                Processes(self._events, self._nursery) as self._processes,
                 self._signals(),
             ):
                 if self._gather():
@@ -338,6 +345,8 @@ class Launcher:
                 self._take_exit(self._nodes[event.node], event)
             case Interrupted():
                 self._outcome.interrupted = True
+            case NurseryLost():
+                self._outcome.failures.append("the process that nodes are started from was killed, and they with it")
             case Said():
                 self._take_said(event)
             case Joined() | Left() | Began() | Ended() | Failed() if self._company is not None:

@@ -95,12 +95,12 @@ class Observations:
         if now < self._next_look:
             return
         self._next_look = now + LOOK_PERIOD
-        pids = {node.pid for node in nodes if node.pid}
-        self._costs = {pid: cost for pid, cost in self._costs.items() if pid in pids}
-        for pid in pids:
+        running = {node.pid: node for node in nodes if node.pid}
+        self._costs = {pid: cost for pid, cost in self._costs.items() if pid in running}
+        for pid, node in running.items():
             if pid not in self._costs:
                 with suppress(psutil.Error):
-                    self._costs[pid] = _Cost(psutil.Process(pid), 0.0, now)
+                    self._costs[pid] = _Cost(psutil.Process(pid), 0.0, node.started_at)
         for cost in self._costs.values():
             cost.look(now)
 

@@ -4,18 +4,16 @@ import contextlib
 import os
 import queue
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from caneflow.runtime.hosts import guard
+from caneflow.runtime.hosts.nursery import Ended, Nursery, Started
 
-# One thread for linear algebra in each process: the flow is parallel already, and sums must not depend on cores.
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+LINES_PATIENCE = 1.0  # s that the last lines of an ended node have to come: a child of it may hold the pipe open
 
 
 class Line(NamedTuple):
@@ -30,88 +28,120 @@ class Exited(NamedTuple):
 
     node: str
     pid: int
-    status: int  # as subprocess has it: negative for a signal
+    status: int  # negative: the signal that ended it
+
+
+class NurseryLost(NamedTuple):
+    """The process that starts nodes has been killed, and every node with it."""
+
+
+@dataclass(eq=False)
+class _Process:
+    """A node's process, from the request for it to its end."""
+
+    node: str
+    reader: threading.Thread
+    pid: int = 0  # 0: not there yet
+    started: threading.Event = field(default_factory=threading.Event)
+    ended: threading.Event = field(default_factory=threading.Event)
 
 
 class Processes:
     """Starts, watches and ends one process per node; a context manager that leaves none behind."""
 
-    def __init__(self, events: "queue.SimpleQueue[object]", folder: Path) -> None:
-        """`folder` is the run's own: every node is started with a path in it, by which the guard finds them."""
+    def __init__(self, events: "queue.SimpleQueue[object]", nursery: Nursery) -> None:
         self._events = events
-        self._running: dict[str, subprocess.Popen[str]] = {}
-        self._guard = subprocess.Popen(
-            [sys.executable, "-I", "-S", guard.__file__, str(folder)],
-            stdin=subprocess.PIPE,
-            start_new_session=True,
-        )
+        self._nursery = nursery
+        self._running: dict[str, _Process] = {}
+        self._asked: queue.SimpleQueue[_Process] = queue.SimpleQueue()  # which the nursery will start, in this order
+        self._closing = False
+        self._listener = threading.Thread(target=self._listen, daemon=True, name="nursery")
 
     def __enter__(self) -> "Processes":
+        self._listener.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.end(list(self._running), patience=1.0)
-        self._guard.kill()  # everything has ended: there is nothing left to guard
-        self._guard.communicate()
+        self._closing = True
+        self._nursery.close()
+        self._listener.join()
 
     def start(self, node: str, program: Sequence[str], plan: Path) -> int:
-        """Start the node's process; its pid."""
-        process = subprocess.Popen(
-            [sys.executable, *program, str(plan)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-            env={**ONE_THREAD, **os.environ, "PYTHONUNBUFFERED": "1"},
-        )
+        """Start the node's process; its pid, or 0 when the nursery is lost."""
+        reading, writing = os.pipe()
+        lines = os.fdopen(reading, encoding="utf-8", errors="replace")
+        process = _Process(node, threading.Thread(target=self._read, args=(node, lines), daemon=True))
+        process.reader.start()
+        try:
+            self._asked.put(process)
+            self._nursery.start([*program, str(plan)], writing)
+            process.started.wait()
+        except OSError:
+            return 0  # the listener knows as well, and has said so
+        finally:
+            os.close(writing)
         self._running[node] = process
-        threading.Thread(target=self._watch, args=(node, process), daemon=True, name=f"watch {node}").start()
         return process.pid
 
     def forget(self, exited: Exited) -> None:
-        """Take note that a process has ended; what it started itself ends with it."""
+        """Take note that a process has ended."""
         process = self._running.get(exited.node)
         if process is not None and process.pid == exited.pid:
             del self._running[exited.node]
-            _signal_group(exited.pid, signal.SIGKILL)
 
     def kill(self, node: str) -> None:
         """End a node's process at once."""
         if node in self._running:
-            _signal_group(self._running[node].pid, signal.SIGKILL)
+            _signal(self._running[node], signal.SIGKILL)
 
     def end(self, nodes: Sequence[str], patience: float) -> list[str]:
         """Ask the nodes' processes to end, kill them after `patience` s; the names of those that were killed."""
-        ending = {node: self._running[node] for node in nodes if node in self._running}
-        for process in ending.values():
-            _signal_group(process.pid, signal.SIGTERM)
+        ending = [self._running.pop(node) for node in nodes if node in self._running]
+        for process in ending:
+            _signal(process, signal.SIGTERM)
         deadline = time.monotonic() + patience
         killed = []
-        for node, process in ending.items():
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=max(0.0, deadline - time.monotonic()))
-            if process.poll() is None:
-                killed.append(node)
-                _signal_group(process.pid, signal.SIGKILL)
-                process.wait()
-            self.forget(Exited(node, process.pid, process.returncode))
+        for process in ending:
+            if not process.ended.wait(max(0.0, deadline - time.monotonic())):
+                killed.append(process.node)
+                _signal(process, signal.SIGKILL)
+                process.ended.wait()
+            process.reader.join(LINES_PATIENCE)
         return killed
 
-    def _watch(self, node: str, process: "subprocess.Popen[str]") -> None:
-        assert process.stdout is not None
-        reader = threading.Thread(target=self._read, args=(node, process.stdout), daemon=True)
-        reader.start()
-        status = process.wait()
-        reader.join(timeout=1.0)  # a child of the node may hold the pipe open
-        self._events.put(Exited(node, process.pid, status))
+    def _listen(self) -> None:
+        """Follow what the nursery says until it ends."""
+        there: dict[int, _Process] = {}
+        while (word := self._nursery.hear()) is not None:
+            match word:
+                case Started(pid):
+                    process = there[pid] = self._asked.get()
+                    process.pid = pid
+                    process.started.set()
+                case Ended(pid, status):
+                    process = there.pop(pid)
+                    process.ended.set()
+                    threading.Thread(target=self._tell_end, args=(process, status), daemon=True).start()
+        if not self._closing:
+            self._events.put(NurseryLost())
+        while not self._asked.empty():
+            self._asked.get().started.set()
+        for process in there.values():
+            process.ended.set()
+
+    def _tell_end(self, process: _Process, status: int) -> None:
+        process.reader.join(LINES_PATIENCE)
+        self._events.put(Exited(process.node, process.pid, status))
 
     def _read(self, node: str, lines: IO[str]) -> None:
-        for line in lines:
-            self._events.put(Line(node, line.rstrip("\n")))
+        with lines:
+            for line in lines:
+                self._events.put(Line(node, line.rstrip("\n")))
 
 
-def _signal_group(pid: int, number: int) -> None:
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(pid, number)
+def _signal(process: _Process, number: int) -> None:
+    """Send the process and what it started a signal, unless it has ended."""
+    if not process.ended.is_set():
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, number)

@@ -1,0 +1,185 @@
+"""The process that a flow's nodes are forked from, so that what they all import is imported once.
+
+A node that starts as an interpreter of its own spends half a second on imports, at every restart too. The nursery is
+forked from the launcher before that has threads, links or users' code, none of which survives a fork. It is the
+parent of the nodes: it tells how each ends, and when the launcher dies, however it dies, it kills them all.
+"""
+
+import atexit
+import contextlib
+import ctypes
+import gc
+import logging
+import os
+import runpy
+import select
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import msgspec
+from setproctitle import setproctitle, setthreadtitle
+
+REQUEST_BYTES = 65_536  # of the longest command line
+PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal for a process whose parent dies
+RESET = (signal.SIGTERM, signal.SIGCHLD)
+
+
+class Started(msgspec.Struct, frozen=True, tag=True):
+    """A node's process is there."""
+
+    pid: int
+
+
+class Ended(msgspec.Struct, frozen=True, tag=True):
+    """A node's process is not there any more."""
+
+    pid: int
+    status: int  # negative: the signal that ended it
+
+
+class Nursery:
+    """The launcher's end: start nodes, and hear of their ends."""
+
+    def __init__(self) -> None:
+        """Fork the nursery; to be done before this process has any thread."""
+        self._socket, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.pid = os.fork()
+        if self.pid == 0:
+            self._socket.close()
+            _end(lambda: _Parent(inner).serve())
+        inner.close()
+
+    def start(self, arguments: Sequence[str], output: int) -> None:
+        """Start what follows `python`; what it writes goes to the descriptor `output`. Started says its pid.
+
+        Raises OSError when the nursery has been killed.
+        """
+        socket.send_fds(self._socket, [msgspec.msgpack.encode(arguments)], [output])
+
+    def hear(self) -> Started | Ended | None:
+        """Wait for the next word; None: the nursery has ended, and its nodes with it."""
+        try:
+            word = self._socket.recv(REQUEST_BYTES)
+        except OSError:  # closed here meanwhile
+            return None
+        return msgspec.msgpack.decode(word, type=Started | Ended) if word else None
+
+    def close(self) -> None:
+        """End it, and whatever it still runs."""
+        with contextlib.suppress(OSError):  # it has ended already
+            self._socket.shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(self.pid, 0)
+        self._socket.close()
+
+
+class _Parent:
+    """The nursery's own end."""
+
+    def __init__(self, inner: socket.socket) -> None:
+        self._socket = inner
+        self._pid = os.getpid()
+        self._running: set[int] = set()
+
+    def serve(self) -> None:
+        """Start nodes and tell of their ends, until the launcher's end of the socket closes."""
+        setproctitle("caneflow.runtime.hosts.nursery")
+        os.setsid()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        with Path(os.devnull).open("rb") as nothing:
+            os.dup2(nothing.fileno(), 0)
+        woken, waker = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.set_wakeup_fd(waker)
+        gc.freeze()  # what is shared stays shared
+        while self._take_request(woken):
+            self._tell_ends(woken)
+        for pid in self._running:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(pid, signal.SIGKILL)
+
+    def _take_request(self, woken: int) -> bool:
+        """Wait for a request or an end, and do what is asked; False when the launcher is gone."""
+        ready, _, _ = select.select([self._socket.fileno(), woken], [], [])
+        if self._socket.fileno() not in ready:
+            return True
+        request, outputs, _, _ = socket.recv_fds(self._socket, REQUEST_BYTES, 1)
+        if not request:
+            return False
+        arguments = msgspec.msgpack.decode(request, type=list[str])
+        pid = os.fork()
+        if pid == 0:
+            self._socket.close()
+            _end(lambda: _become(arguments, outputs[0], parent=self._pid))
+        os.close(outputs[0])
+        self._running.add(pid)
+        self._say(Started(pid))
+        return True
+
+    def _tell_ends(self, woken: int) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(woken, REQUEST_BYTES)
+        for pid in list(self._running):
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if ended:
+                self._running.remove(pid)
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.killpg(pid, signal.SIGKILL)  # what it started itself ends with it
+                self._say(Ended(pid, os.waitstatus_to_exitcode(status)))
+
+    def _say(self, word: Started | Ended) -> None:
+        with contextlib.suppress(OSError):  # the launcher is gone: the next request is its end
+            self._socket.send(msgspec.msgpack.encode(word))
+
+
+def _become(arguments: Sequence[str], output: int, parent: int) -> None:
+    """Be what `python ARGUMENTS` would be, in a session of its own, from a fork."""
+    os.setsid()
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it died in between
+        os.kill(os.getpid(), signal.SIGKILL)
+    signal.set_wakeup_fd(-1)
+    for number in RESET:
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    os.closerange(3, os.sysconf("SC_OPEN_MAX"))
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # typeshed takes them for any TextIO
+    setproctitle(" ".join(("python", *arguments)))
+    setthreadtitle(Path(arguments[-1]).stem)  # the node's name, where only fifteen letters are shown
+    if arguments[0] == "-m":
+        sys.argv = list(arguments[1:])
+        runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+    else:
+        sys.argv = list(arguments)
+        sys.path.insert(0, str(Path(arguments[0]).parent))
+        runpy.run_path(arguments[0], run_name="__main__")
+
+
+def _end(work: Callable[[], None]) -> NoReturn:
+    """Do `work` in a fork, then end the process without going back to what was forked; as an interpreter ends."""
+    status = 1
+    try:
+        work()
+        status = 0
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            sys.stderr.write(f"{end.code}\n")
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        atexit._run_exitfuncs()
+        logging.shutdown()
+        with contextlib.suppress(OSError, ValueError):  # the reader of the pipe may be gone
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(status)
