@@ -22,11 +22,11 @@ from annotated_types import Ge, Le
 from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.control import FlowStatus
-from caneflow.messages.rig import Rig
+from caneflow.messages.rig import Rig, read_rig
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.attach import ANY, Attached, Heard, attached
-from caneflow.runtime.hosts.run_directory import rig_of, running_flows
+from caneflow.runtime.hosts.run_directory import running_flows
 from caneflow.runtime.node import run
 from caneflow.viewing.live import LiveStreams
 from caneflow.viewing.recorded import RecordedStreams
@@ -108,7 +108,7 @@ def _again(flow: str, at: str | None) -> Iterator[tuple[Attached, FlowStatus]]:
 
 
 def _streams(status: FlowStatus) -> LiveStreams:
-    return LiveStreams(flow=status.flow, rig=rig_of(status.flow), live=False if status.replay else None)
+    return LiveStreams(flow=status.flow, rig=read_rig(status.rig), live=False if status.replay else None)
 
 
 def _relay(here: Attached, status: FlowStatus, streams: LiveStreams, *, local: bool) -> None:

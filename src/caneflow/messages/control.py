@@ -1,5 +1,7 @@
 """What a flow says about itself, under `<flow>/@/...`: progress, counters, states. Never part of the result."""
 
+from typing import Any
+
 import msgspec
 
 
@@ -144,3 +146,4 @@ class FlowStatus(msgspec.Struct, frozen=True, kw_only=True):
     machine: str  # its name in the file; "" when the flow has only one
     nodes: list[NodeStatus]
     edges: list[EdgeStatus]
+    rig: dict[str, Any] = {}  # that its nodes were given

@@ -183,6 +183,7 @@ def merged(answers: Sequence[FlowStatus]) -> FlowStatus:
         machine=first.machine,
         nodes=nodes,
         edges=edges,
+        rig=next((answer.rig for answer in answers if answer.rig), {}),
     )
 
 

@@ -118,6 +118,7 @@ class Observations:
             machine=machine,
             nodes=[self._node(name, node, now, machine) for name, node in nodes.items()],
             edges=[edge for name, node in nodes.items() for edge in self._edges(name, node)],
+            rig=next((node.plan.rig for node in nodes.values()), {}),
         )
 
     def _node(self, name: str, node: ObservedNode, now: float, machine: str) -> NodeStatus:

@@ -5,15 +5,9 @@ import shutil
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import psutil
-
-from caneflow.runtime.errors import DataflowError
-
-if TYPE_CHECKING:
-    from caneflow.messages.rig import Rig
 
 
 class RunningFlow(msgspec.Struct, frozen=True):
@@ -50,18 +44,6 @@ def running_flows() -> list[RunningFlow]:
             if psutil.pid_exists(flow.pid):
                 found[flow.pid] = flow
     return sorted(found.values(), key=lambda flow: (flow.flow, flow.pid))
-
-
-def rig_of(flow: str) -> "Rig":
-    """The rig that the nodes of a flow on this machine were given; an empty one when there is no such flow here."""
-    from caneflow.messages.rig import Rig, read_rig  # here, as these take as long to import as all the rest
-    from caneflow.runtime.plan import NodePlan
-
-    for path in (path for root in _roots() for path in sorted(root.glob(f"{flow}-*/*.json"))):
-        if path.name != "flow.json" and psutil.pid_exists(int(path.parent.name.rpartition("-")[2])):
-            with suppress(DataflowError):  # it may be ending, or be somebody else's
-                return read_rig(NodePlan.read(path).rig)
-    return Rig()
 
 
 def _root() -> Path:
