@@ -30,7 +30,16 @@ def test_the_schema_knows_every_key_and_no_other() -> None:
 
     assert schema["required"] == ["flow", "nodes"]
     assert schema["additionalProperties"] is False
-    assert set(schema["properties"]) == {"flow", "seed", "rig", "machines", "insecure", "nodes", "results"}
+    assert set(schema["properties"]) == {
+        "flow",
+        "seed",
+        "rig",
+        "machines",
+        "router",
+        "insecure",
+        "nodes",
+        "results",
+    }
     assert node["additionalProperties"] is False
     short, long = node["properties"]["inputs"]["patternProperties"]["^[a-z][a-z0-9_]*$"]["anyOf"]
     assert re.fullmatch(short["pattern"], "radar/frame")

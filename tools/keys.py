@@ -1,13 +1,17 @@
 """`caneflow keys`: a flow's own authority, and a certificate for each machine that may take part."""
 
 import datetime
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts import certificates
+from caneflow.runtime.hosts.security import router_settings
 
 Folder = Annotated[Path, typer.Option("--keys", metavar="DIR", help="where they are kept")]
 DEFAULT_FOLDER = Path("keys")  # `caneflow run FILE` looks for it beside the file
@@ -48,6 +52,28 @@ def add(
     print(f"{certificate}: made; {name} needs {own}")
 
 
+def router(
+    file: Annotated[Path, typer.Argument(help="the dataflow, with its `router:`")], folder: Folder = DEFAULT_FOLDER
+) -> None:
+    """Print the configuration of a Zenoh router that passes on between the machines of a flow.
+
+    Each machine may say through it what is its own and hear what its nodes read. The router needs a certificate of
+    its own, which `caneflow keys add router` makes; give zenohd the file with --config.
+
+    Example: caneflow keys router dataflow.yaml > router.json5
+    """
+    graph = load(file)
+    if graph.router is None:
+        raise DataflowError(f"{file}: names no router; write e.g. `router: tcp/broker.local:7447`")
+    own = certificates.credentials(folder, certificates.ROUTER)
+    if own is None:
+        raise DataflowError(f"{folder}: holds no certificate of the router; `caneflow keys add router` makes it")
+    deployment = deploy(graph, machine=next(iter(graph.machines)))
+    if deployment.site is None:
+        raise DataflowError(f"{file}: runs on one machine; there is nothing to pass on")
+    print(json.dumps(router_settings(deployment, deployment.site, own), indent=2))
+
+
 def show(folder: Folder = DEFAULT_FOLDER) -> None:
     """Show the certificates of a folder, and until when they hold.
 
@@ -71,4 +97,4 @@ def _need_library() -> None:
         raise DataflowError("needs the package cryptography; pip install 'caneflow[secure]'") from error
 
 
-commands = {"init": init, "add": add, "list": show}
+commands = {"init": init, "add": add, "list": show, "router": router}

@@ -50,6 +50,7 @@ class Site:
     places: Mapping[str, str]  # by node the machine that it runs on
     listen: tuple[str, ...]
     connect: tuple[str, ...]
+    router: str | None = None  # an endpoint that all machines dial; None: they dial each other
     recorders: frozenset[str] = frozenset()  # the machines that may read every stream
     insecure: bool = False  # the file says that machines talk in the clear
 
@@ -209,7 +210,8 @@ def _site(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | None:
         others=tuple(name for name in used if name in written.linked),
         places=places,
         listen=written.listen,
-        connect=written.connect,
+        connect=(*written.connect, *filter(None, (graph.router,))),
+        router=graph.router,
         recorders=frozenset(name for name in used if graph.machines[name].records),
         insecure=graph.insecure,
     )

@@ -84,6 +84,7 @@ class Graph:
     nodes: dict[str, Node]  # in the order of the file
     results: tuple[str, ...]  # outputs, `node/port`, that are for people and recordings
     path: Path
+    router: str | None = None  # the endpoint of a Zenoh router that every machine dials
     insecure: bool = False  # machines talk in the clear, with whoever reaches them
     leader: str | None = None  # the machine whose launcher starts and ends the others; None: there is only one
     warnings: tuple[str, ...] = field(default=())

@@ -96,6 +96,7 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
         nodes=nodes,
         results=tuple(flow.results),
         path=path,
+        router=flow.router,
         insecure=flow.insecure,
         leader=layout.leader,
         warnings=tuple(map(str, _sorted(document))),

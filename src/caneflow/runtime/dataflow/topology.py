@@ -1,7 +1,7 @@
 """Checks the machines of a graph: that samples can reach every reader.
 
 Zenoh peers do not relay for peers, and say nothing about it: two machines that share a wire need a link of their
-own, which exactly one of the two dials.
+own, which exactly one of the two dials, or a router that both dial.
 """
 
 import ipaddress
@@ -15,7 +15,7 @@ from caneflow.runtime.wording import did_you_mean, listed
 
 EVERYWHERE = {"0.0.0.0", "[::]"}  # noqa: S104 - compared with, not bound to
 HIGHEST_PORT = 65535
-RESERVED = {"ca", "observer"}  # names among the keys of a flow
+RESERVED = {"ca", "observer", "router"}  # names among the keys of a flow
 
 
 class Layout(NamedTuple):
@@ -38,6 +38,9 @@ def check_machines(document: Document, flow: FlowShape, parts: Mapping[str, Part
     """The machine of every node, and the one that leads; what is wrong is noted."""
     places = {name: _machine_of(document, flow, name, part) for name, part in parts.items()}
     reached = _reached(document, flow)
+    if flow.router is not None:
+        _check_port(document, ("router",), flow.router)
+        reached = {name: set(flow.machines) - {name} for name in flow.machines}
     dead = False
     for reader, part in parts.items():
         for port, wire in part.wires.items():
@@ -105,9 +108,7 @@ def _reached(document: Document, flow: FlowShape) -> dict[str, set[str]]:
     for name, machine in flow.machines.items():
         for word, endpoints in (("listen", machine.listen), ("connect", machine.connect)):
             for i, endpoint in enumerate(endpoints):
-                port = _parts(endpoint).port
-                if not 1 <= port <= HIGHEST_PORT:
-                    document.problem(("machines", name, word, i), f"has port {port}; ports are 1..{HIGHEST_PORT}")
+                _check_port(document, ("machines", name, word, i), endpoint)
         for i, endpoint in enumerate(machine.connect):
             met = _met(flow, name, _parts(endpoint))
             reached[name] |= met
@@ -123,6 +124,12 @@ def _reached(document: Document, flow: FlowShape) -> dict[str, set[str]]:
                     warning=True,
                 )
     return reached
+
+
+def _check_port(document: Document, path: tuple[str | int, ...], endpoint: str) -> None:
+    port = _parts(endpoint).port
+    if not 1 <= port <= HIGHEST_PORT:
+        document.problem(path, f"has port {port}; ports are 1..{HIGHEST_PORT}")
 
 
 def _met(flow: FlowShape, dialling: str, dialled: Endpoint) -> set[str]:

@@ -165,6 +165,10 @@ class FlowShape(Shape):
     seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="where all random numbers of the flow come from")] = 0
     rig: Annotated[Rig, Field(default_factory=Rig, description="what is bolted on")]
     machines: Annotated[dict[Name, MachineShape], Field(description="when the flow runs on several computers")] = {}
+    router: Annotated[
+        Endpoint | None,
+        Field(description="a Zenoh router (zenohd) that every machine dials; they need no links with each other then"),
+    ] = None
     insecure: Annotated[
         bool, Field(description="machines talk in the clear, with whoever reaches them; else with keys only")
     ] = False

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 AUTHORITY = "ca"
 OBSERVER = "observer"  # the common name of everybody who may look and not touch
+ROUTER = "router"  # that of a router which passes on for all machines
 AUTHORITY_DAYS = 3650
 MACHINE_DAYS = 730
 SKEW = datetime.timedelta(days=1)  # a machine without a clock battery may be behind

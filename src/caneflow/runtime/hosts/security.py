@@ -4,7 +4,7 @@ The rules come from the graph. Each launcher holds them against what comes in an
 machine that was taken over can neither write what is not its own nor read what it has no use for.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,7 +13,7 @@ from caneflow.messages import MAX_PAYLOAD, control_key, sample_key
 from caneflow.runtime.dataflow.topology import is_open
 from caneflow.runtime.deployment import Deployment, Site, recorder_name
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.certificates import OBSERVER, Credentials, credentials
+from caneflow.runtime.hosts.certificates import OBSERVER, ROUTER, Credentials, credentials
 from caneflow.runtime.plan import NodePlan
 
 Grants: TypeAlias = dict[str, list[str]]  # by kind of message the keys
@@ -42,17 +42,7 @@ def secured_links(deployment: Deployment, site: Site, own: Credentials) -> dict[
     control = access_control(deployment, site)
     check_access_control(control)
     return {
-        "transport/link/tls": {
-            "root_ca_certificate": str(own.authority),
-            "enable_mtls": True,
-            "listen_certificate": str(own.certificate),
-            "listen_private_key": str(own.key),
-            "connect_certificate": str(own.certificate),
-            "connect_private_key": str(own.key),
-            # Who is at the other end is known by its common name, at either end of the link; addresses change.
-            "verify_name_on_connect": False,
-            "close_link_on_expiration": True,
-        },
+        "transport/link/tls": _mutual_tls(own),
         "access_control": control,
         "low_pass_filter": [
             {
@@ -90,23 +80,46 @@ def links_between(deployment: Deployment, site: Site, keys: Path | None) -> tupl
 
 def access_control(deployment: Deployment, site: Site) -> dict[str, Any]:
     """The rules of one machine's launcher, as Zenoh takes them."""
-    everything = _everything(deployment.flow)
-    rules = [_rule("everything", "ingress", kind, everything) for kind in KINDS]
-    rules += [_rule("everything", "egress", kind, everything) for kind in KINDS]
-    subjects: list[dict[str, Any]] = [{"id": "here", "link_protocols": [LOCAL]}]
-    policies = [{"subjects": ["here"], "rules": [rule["id"] for rule in rules]}]
     both_ways = {
         other: (machine_grants(deployment, site, other, site.name), machine_grants(deployment, site, site.name, other))
         for other in site.others
     }
     both_ways[OBSERVER] = observer_grants(deployment.flow)
-    for other, (comes, goes) in both_ways.items():
-        own = [_rule(other, "ingress", kind, keys) for kind, keys in comes.items() if keys]
-        own += [_rule(other, "egress", kind, keys) for kind, keys in goes.items() if keys]
-        rules += own
-        subjects.append({"id": other, "cert_common_names": [other]})
-        policies.append({"subjects": [other], "rules": [rule["id"] for rule in own]})
-    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
+    if site.router is not None:
+        # What comes from the router is anybody's: that each machine says only what is its own, the router sees to.
+        ways = list(both_ways.values())
+        both_ways[ROUTER] = (_together(comes for comes, _ in ways), _together(goes for _, goes in ways))
+    control = _default_deny(both_ways)
+    everything = dict.fromkeys(KINDS, _everything(deployment.flow))
+    rules = _rules("everything", everything, everything)
+    control["rules"] += rules
+    control["subjects"].append({"id": "here", "link_protocols": [LOCAL]})
+    control["policies"].append({"subjects": ["here"], "rules": [rule["id"] for rule in rules]})
+    return control
+
+
+def router_settings(deployment: Deployment, site: Site, own: Credentials) -> dict[str, Any]:
+    """The configuration of a Zenoh router that passes on for all machines of the flow, and holds each to its rules."""
+    assert site.router is not None
+    machines = (site.name, *site.others)
+    asks, gets = observer_grants(deployment.flow)
+    both_ways = {OBSERVER: (asks, gets)}
+    for machine in machines:
+        others = [other for other in machines if other != machine]
+        comes = [machine_grants(deployment, site, machine, other) for other in others]
+        goes = [machine_grants(deployment, site, other, machine) for other in others]
+        observed = observed_grants(deployment, site, machine)
+        both_ways[machine] = (_together([*comes, observed]), _together([*goes, asks]))
+    control = _default_deny(both_ways)
+    check_access_control(control)
+    port = site.router.rpartition(":")[2]
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [f"tls/[::]:{port}"]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"link": {"tls": _mutual_tls(own)}},
+        "access_control": control,
+    }
 
 
 def machine_grants(deployment: Deployment, site: Site, sender: str, receiver: str) -> Grants:
@@ -162,6 +175,15 @@ def observer_grants(flow: str) -> tuple[Grants, Grants]:
     return asks, gets
 
 
+def observed_grants(deployment: Deployment, site: Site, machine: str) -> Grants:
+    """What `machine` may send to observers behind a router: all that is its own."""
+    flow = deployment.flow
+    nodes = _nodes_on(deployment, site, machine)
+    counted = [control_key(flow, word, node) for node in nodes for word in ("progress", "counters")]
+    status = [control_key(flow, "status")]
+    return {"put": [*_written_on(deployment, site, machine), *counted], "declare_queryable": status, "reply": status}
+
+
 def check_access_control(control: Mapping[str, Any]) -> None:
     """Raise DataflowError for rules that Zenoh would take without a word and not keep."""
     rules, subjects = ({each["id"] for each in control[what]} for what in ("rules", "subjects"))
@@ -179,6 +201,51 @@ def check_access_control(control: Mapping[str, Any]) -> None:
     for subject in control["subjects"]:
         if not subject.get("cert_common_names") and not subject.get("link_protocols"):
             raise DataflowError(f"access control: the subject {subject['id']!r} would be everybody")
+
+
+def _mutual_tls(own: Credentials) -> dict[str, Any]:
+    return {
+        "root_ca_certificate": str(own.authority),
+        "enable_mtls": True,
+        "listen_certificate": str(own.certificate),
+        "listen_private_key": str(own.key),
+        "connect_certificate": str(own.certificate),
+        "connect_private_key": str(own.key),
+        # Who is at the other end is known by its common name, at either end of the link; addresses change.
+        "verify_name_on_connect": False,
+        "close_link_on_expiration": True,
+    }
+
+
+def _default_deny(both_ways: Mapping[str, tuple[Grants, Grants]]) -> dict[str, Any]:
+    """Access control by common name: what may come from it, and what may go to it."""
+    control: dict[str, Any] = {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [],
+        "subjects": [],
+        "policies": [],
+    }
+    for name, (comes, goes) in both_ways.items():
+        rules = _rules(name, comes, goes)
+        control["rules"] += rules
+        control["subjects"].append({"id": name, "cert_common_names": [name]})
+        control["policies"].append({"subjects": [name], "rules": [rule["id"] for rule in rules]})
+    return control
+
+
+def _together(grants: Iterable[Grants]) -> Grants:
+    """What any of `grants` allows."""
+    union: Grants = {}
+    for each in grants:
+        for kind, keys in each.items():
+            union[kind] = list(dict.fromkeys([*union.get(kind, []), *keys]))
+    return union
+
+
+def _rules(name: str, comes: Grants, goes: Grants) -> list[dict[str, Any]]:
+    ways = (("ingress", comes), ("egress", goes))
+    return [_rule(name, way, kind, keys) for way, grants in ways for kind, keys in grants.items() if keys]
 
 
 def _rule(name: str, way: str, kind: str, keys: list[str]) -> dict[str, Any]:
@@ -203,17 +270,21 @@ def _nodes_on(deployment: Deployment, site: Site, machine: str) -> list[str]:
 
 def _samples_between(deployment: Deployment, site: Site, writer: str, reader: str) -> list[str]:
     """The keys that nodes on `writer` publish and nodes on `reader` read."""
-    plans = deployment.plans
-    written = {
-        sample_key(deployment.flow, name, port)
-        for name, plan in plans.items()
-        if site.places[name] == writer
-        for port in plan.outputs
-    }
+    plans, written = deployment.plans, _written_on(deployment, site, writer)
     if reader in site.recorders:
         return sorted(written)
     read = {wire.key for name, plan in plans.items() if site.places[name] == reader for wire in plan.inputs.values()}
     return sorted(written & read)
+
+
+def _written_on(deployment: Deployment, site: Site, machine: str) -> set[str]:
+    """The keys that nodes on `machine` publish."""
+    return {
+        sample_key(deployment.flow, name, port)
+        for name, plan in deployment.plans.items()
+        if site.places[name] == machine
+        for port in plan.outputs
+    }
 
 
 def _reads_of(deployment: Deployment, site: Site, reader: str, writer: str) -> bool:
