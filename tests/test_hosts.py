@@ -9,6 +9,9 @@ import pytest
 
 from caneflow.messages import Imu, decode, numbered, sample_key
 from caneflow.recording import Recording, RecordingWriter
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.deployment import deploy
+from tests.flows import NODES, spread_cane
 
 TICK = 10_000_000  # ns
 
@@ -200,3 +203,12 @@ def test_a_node_left_out_ends_its_readers_inputs(flow: Path, tmp_path: Path) -> 
     without = [(port, seq) for port, seq in expected(stamps) if port != 1]
     # With b gone the port order stays; only its samples are missing.
     assert order_of(got) == without
+
+
+def test_only_what_a_reader_puts_in_order_with_other_streams_is_awaited(tmp_path: Path) -> None:
+    file = tmp_path / "cane.yaml"
+    file.write_text(spread_cane("cane", "  here: {}\n", dict.fromkeys(NODES, "here")))
+    plans = deploy(load(file), record=tmp_path / "out.mcap").plans
+    awaited = {out.key for plan in plans.values() for out in plan.outputs.values() if out.awaited}
+    assert awaited == {"cane/imu/imu", "cane/radar/frame", "cane/ground_speed/speed"}
+    assert plans["fusion"].outputs["pose"].readers == ("recorder",)

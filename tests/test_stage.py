@@ -43,12 +43,12 @@ def imu(stamp: int, seq: int, x: float = 1.0) -> Imu:
     return Imu(stamp=stamp, seq=seq, gyro=(x, 0.0, 0.0))
 
 
-def stage(operator: Operator | None = None, **overrides: object) -> Stage:
+def stage(operator: Operator | None = None, *, awaited: bool = True, **overrides: object) -> Stage:
     inputs: Mapping[str, InputPlan] = {
         port: InputPlan(key=f"f/{port}/imu", schema="caneflow.Imu/1", writer=port, **overrides)  # type: ignore[arg-type]  # one override of a known field
         for port in ("a", "b")
     }
-    outputs = {"speed": OutputPlan(key="f/echo/speed", schema="caneflow.GroundSpeed/1")}
+    outputs = {"speed": OutputPlan(key="f/echo/speed", schema="caneflow.GroundSpeed/1", awaited=awaited)}
     return Stage("echo", operator or Echo(), inputs, outputs)
 
 
@@ -80,6 +80,19 @@ def test_a_mark_counts_only_when_what_was_sent_before_it_has_come() -> None:
     host.offer("b", imu(5, 0))
     assert emitted(host) == [(10, 0)]
     assert host.progress().handled == 10
+
+
+@pytest.mark.parametrize("awaited", [True, False])
+def test_how_far_it_has_come_is_said_at_once_only_where_a_reader_waits_for_it(awaited: bool) -> None:
+    host = stage(awaited=awaited)
+    host.offer("a", imu(10, 0))
+    host.mark("b", PortMark(-1, 10))
+    assert emitted(host) == [(10, 0)]
+    assert not host.tells_more_than_samples(), "the sample at 10 says it"
+    host.offer("b", imu(20, 0))
+    host.mark("a", PortMark(0, 20))
+    assert emitted(host) == []
+    assert host.tells_more_than_samples() is awaited
 
 
 def test_repeated_backwards_and_lost_samples_are_told_apart(caplog: pytest.LogCaptureFixture) -> None:

@@ -378,15 +378,12 @@ def _recorder(
 
 
 def _with_readers(plan: NodePlan, plans: dict[str, NodePlan], rig: dict[str, Any], replay: bool) -> NodePlan:
-    outputs = {
-        port: msgspec.structs.replace(
-            out,
-            readers=tuple(
-                other.node for other in plans.values() if any(wire.key == out.key for wire in other.inputs.values())
-            ),
-        )
-        for port, out in plan.outputs.items()
-    }
+    outputs = {}
+    for port, out in plan.outputs.items():
+        readers = [other for other in plans.values() if any(wire.key == out.key for wire in other.inputs.values())]
+        awaited = any(len(other.inputs) > 1 and other.outputs for other in readers)
+        names = tuple(other.node for other in readers)
+        outputs[port] = msgspec.structs.replace(out, readers=names, awaited=awaited)
     inputs = plan.inputs
     if replay:  # nothing may be lost, and nobody has a clock to lag behind: the sources wait instead
         inputs = {

@@ -39,6 +39,7 @@ class OutputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     key: str
     schema: str
     readers: tuple[str, ...] = ()  # the nodes that read it, the recorder among them
+    awaited: bool = True  # one of them puts it in order with other streams: it waits to hear how far this one has come
 
     @cached_property
     def kind(self) -> type[Sample]:

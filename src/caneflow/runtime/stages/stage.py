@@ -121,9 +121,9 @@ class Stage:
         self.finished = state.finished
 
     def tells_more_than_samples(self) -> bool:
-        """Whether a reader cannot see from the samples alone how far this node has come."""
+        """Whether a reader waits, and cannot see from the samples alone, how far this node has come."""
         handled = self._merge.handled()
-        return any(out.last_stamp < handled for out in self.outputs.values())
+        return any(out.plan.awaited and out.last_stamp < handled for out in self.outputs.values())
 
     def left_out(self) -> list[LeftOut]:
         """What was not handled since this was last asked."""
