@@ -12,6 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from caneflow.examinations import p440
 from caneflow.protocols import mrm
 from tools import doctor
 
@@ -118,7 +119,7 @@ def test_a_host_without_a_radar(look: Any, udp: socket.socket) -> None:
 
 
 def test_a_radar_whose_answers_do_not_come(look: Any, udp: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "ANSWER_TIME", 0.02)
+    monkeypatch.setattr(p440, "ANSWER_TIME", 0.02)
     port = udp.getsockname()[1]
     (finding,), _ = look(radar(port), "radar/frame")
     assert finding["text"] == f"no P440 at 127.0.0.1, UDP port {port}: no answer, asked 4 times"

@@ -20,6 +20,7 @@ import typer
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from caneflow.examinations import mpu9250, p440, ports
 from caneflow.protocols import mrm
 from caneflow.protocols.mpu9250_emulator import Emulator, Faults, Motion
 from caneflow.protocols.mrm_emulator import Moment, RadarEmulator
@@ -118,8 +119,8 @@ def test_a_radar_that_answers(look: Look, radar: int) -> None:
 
 
 def test_a_network_without_a_way(look: Look, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "ANSWER_TIME", 0.02)
-    monkeypatch.setattr(doctor, "_own_address", lambda host: "10.1.2.3")
+    monkeypatch.setattr(p440, "ANSWER_TIME", 0.02)
+    monkeypatch.setattr(p440, "_own_address", lambda host: "10.1.2.3")
     findings, status = look("radar: {run: drivers.p440, settings: {host: 192.0.2.7}}", "radar/frame")
     assert status == 1
     (finding,) = findings
@@ -131,9 +132,9 @@ def test_a_firewall_that_is_on_is_the_first_suspect(
     look: Look, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "ufw.conf").write_text("ENABLED=yes\n")
-    monkeypatch.setattr(doctor, "FIREWALL", tmp_path / "ufw.conf")
-    monkeypatch.setattr(doctor, "ANSWER_TIME", 0.02)
-    monkeypatch.setattr(doctor, "_own_address", lambda host: "192.0.2.10")
+    monkeypatch.setattr(p440, "FIREWALL", tmp_path / "ufw.conf")
+    monkeypatch.setattr(p440, "ANSWER_TIME", 0.02)
+    monkeypatch.setattr(p440, "_own_address", lambda host: "192.0.2.10")
     (finding,), _ = look("radar: {run: drivers.p440, settings: {host: 192.0.2.7}}", "radar/frame")
     assert "sudo ufw allow" in finding["attempts"][0]
 
@@ -151,7 +152,7 @@ def test_a_port_that_is_the_systems_console(look: Look, monkeypatch: pytest.Monk
     ends = os.openpty()
     port = os.ttyname(ends[1])
     (tmp_path / "cmdline").write_text(f"root=/dev/sda console={port.removeprefix('/dev/')},115200 console=tty1\n")
-    monkeypatch.setattr(doctor, "KERNEL_OPTIONS", tmp_path / "cmdline")
+    monkeypatch.setattr(ports, "KERNEL_OPTIONS", tmp_path / "cmdline")
     findings, _ = look(f"imu: {{run: drivers.bno055, settings: {{port: {port}}}}}", "imu/imu")
     for end in ends:
         os.close(end)
@@ -165,7 +166,7 @@ def test_a_port_that_is_the_systems_console(look: Look, monkeypatch: pytest.Monk
 def test_a_raspberry_pis_own_bus(look: Look, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "i2c-1").mkdir()
     (tmp_path / "i2c-1" / "name").write_text("bcm2835 (i2c@7e804000)\n")
-    monkeypatch.setattr(doctor, "I2C_NAMES", tmp_path)
+    monkeypatch.setattr(ports, "I2C_NAMES", tmp_path)
     monkeypatch.setattr(Path, "exists", lambda path, **_: True)
     monkeypatch.setattr(os, "access", lambda *_, **__: True)
     findings, status = look("imu: {run: drivers.bno055, settings: {bus: i2c, port: /dev/i2c-1}}", "imu/imu")
@@ -176,7 +177,7 @@ def test_a_raspberry_pis_own_bus(look: Look, monkeypatch: pytest.MonkeyPatch, tm
 
 @pytest.mark.parametrize(("node", "package"), [("bno055", "serial"), ("mpu9250", "smbus2")])
 def test_a_package_that_is_missing(look: Look, monkeypatch: pytest.MonkeyPatch, node: str, package: str) -> None:
-    monkeypatch.setattr(doctor, "find_spec", lambda name: None)
+    monkeypatch.setattr(ports, "find_spec", lambda name: None)
     (finding,), status = look(f"imu: {{run: drivers.{node}}}", "imu/imu")
     assert (status, finding["text"]) == (1, f"no Python package {package}")
     assert finding["attempts"] == ["pip install 'caneflow[devices]'"]
@@ -209,9 +210,9 @@ def belt(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         def opened_bus(_: object) -> Iterator[Callable[[int, bytes, int], bytes]]:
             yield lambda address, data, length: chip.transfer(address, data, length, time.monotonic())
 
-        monkeypatch.setattr(doctor, "opened_bus", opened_bus)
+        monkeypatch.setattr(mpu9250, "opened_bus", opened_bus)
         monkeypatch.setattr("caneflow.drivers.mpu9250.opened_bus", opened_bus)
-        monkeypatch.setattr(doctor, "_at_port", lambda *_: iter(()))
+        monkeypatch.setattr(mpu9250, "at_port", lambda *_: iter(()))
 
     return put
 
