@@ -10,7 +10,7 @@ import enum
 import importlib
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
@@ -21,6 +21,8 @@ from caneflow.runtime.errors import DataflowError
 
 INT64 = range(-(2**63), 2**63)
 PLAIN = (type(None), bool, float, str, bytes)
+JUST_PLAIN = frozenset(PLAIN)
+PLAIN_OR_INT = JUST_PLAIN | {int}
 OWN_PACKAGE = "caneflow."
 KEEPABLE = "only plain data and caneflow's classes can be kept"
 FOREIGN = ("builtins", "math", "numpy")  # whose types and functions may be referred to, by name
@@ -56,6 +58,8 @@ class _Packer:
             return value
         if type(value) is int:
             return value if value in INT64 else ["int", str(value)]
+        if type(value) is tuple:
+            return ["tuple", None, self._items(value, path)]
         if type(value) is complex:
             return ["complex", value.real, value.imag]
         if isinstance(value, np.generic):
@@ -68,21 +72,19 @@ class _Packer:
         if isinstance(value, (type, np.dtype, enum.Enum)) or _is_function(value):
             return self._named(value, path)
         if isinstance(value, tuple):
-            items = [self.packed(item, f"{path}[{i}]") for i, item in enumerate(value)]
-            return ["tuple", None if type(value) is tuple else self._class_name(value, path), items]
+            return ["tuple", self._class_name(value, path), self._items(value, path)]
         if isinstance(value, np.ndarray) and isinstance(value.base, np.ndarray):
             return self._view(value, path)  # its base comes first, under a number of its own
         number = self._remember(value)
         if isinstance(value, np.ndarray):
             return ["array", number, *_array(value, path)]
         if type(value) is list:
-            return ["list", number, [self.packed(item, f"{path}[{i}]") for i, item in enumerate(value)]]
+            return ["list", number, self._items(value, path)]
         if type(value) in (set, frozenset):
             items = [self.packed(item, path) for item in sorted(value, key=repr)]
             return ["set", number, type(value) is frozenset, items]
         if type(value) is deque:
-            items = [self.packed(item, f"{path}[{i}]") for i, item in enumerate(value)]
-            return ["deque", number, value.maxlen, items]
+            return ["deque", number, value.maxlen, self._items(value, path)]
         if type(value) is dict:
             return ["dict", number, self._pairs(value, path)]
         if isinstance(value, np.random.Generator):
@@ -96,6 +98,14 @@ class _Packer:
                 f"{path} is a {type(value).__name__}; only plain data and caneflow's classes can be kept"
             )
         return ["object", number, self._class_name(value, path), self._pairs(_attributes(value), path)]
+
+    def _items(self, values: Collection[Any], path: str) -> list[Any]:
+        kinds = set(map(type, values))
+        if kinds <= JUST_PLAIN:  # most are, and there are many
+            return list(values)
+        if kinds <= PLAIN_OR_INT and all(item in INT64 for item in values if type(item) is int):
+            return list(values)
+        return [self.packed(item, f"{path}[{i}]") for i, item in enumerate(values)]
 
     def _pairs(self, values: dict[Any, Any], path: str) -> list[Any]:
         return [[self.packed(key, path), self.packed(item, f"{path}.{key}")] for key, item in values.items()]
