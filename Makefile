@@ -40,7 +40,8 @@ docs: $(BIN)/.installed
 	$(BIN)/python -m caneflow.runtime.dataflow.yaml_reference docs
 	$(BIN)/sphinx-build --fail-on-warning --quiet docs build/site
 
-# The long tests: every shared walk at real time and at full speed, calm and under load.
+# The long tests: every shared walk at real time and at full speed, calm and under load; kills, freezes, networks; fuzzing
+# with CANEFLOW_FUZZ_TIMES=100 times as many examples as in CI, CANEFLOW_SOAK_MINUTES of random kills.
 soak: $(BIN)/.installed
 	$(BIN)/pytest -m long
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
+from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings, level_covariance
 from caneflow.algorithms.dead_reckoning import PoseEstimate
+from caneflow.algorithms.heading_hypotheses import Heading
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,
@@ -275,3 +276,19 @@ def test_what_is_missing_is_named() -> None:
         cane.imu(START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), None, None)
     with pytest.raises(ValueError, match="neither linear_accel nor accel"):
         cane.imu(START_NS, (0.0, 0.0, 0.0), None, held(0.0), None)
+
+
+def test_covariance_is_turned_and_takes_in_heading_and_scale() -> None:
+    """Against the sum of its parts: what the filter has, turned; what turns and what stretches the track."""
+    root = np.random.default_rng(8).normal(size=(4, 4))
+    motion, yaw, scale = root @ root.T, 0.7, 0.02
+    heading = Heading(position=3 - 2j, yaw=yaw, yaw_variance=0.01, xx=0.5, xy=-0.1, yy=0.3)
+    velocity = 0.8 + 0.3j
+    got = level_covariance(motion, heading, complex(math.cos(yaw), math.sin(yaw)), velocity, scale)
+    rotation = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    expected = np.kron(np.eye(2), rotation) @ motion @ np.kron(np.eye(2), rotation).T
+    expected[:2, :2] += np.array([[0.5, -0.1], [-0.1, 0.3]]) + scale**2 * np.outer([3, -2], [3, -2])
+    expected[2:, 2:] += 0.01 * np.outer([-0.3, 0.8], [-0.3, 0.8])
+    level = [0, 1, 3, 4]
+    assert got[np.ix_(level, level)] == pytest.approx(expected)
+    assert not got[[2, 5]].any() and not got[:, [2, 5]].any()

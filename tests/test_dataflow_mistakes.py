@@ -119,7 +119,9 @@ nodes:
 """
     lines = mistakes(folder, text)
 
-    assert lines[0] == "2:1: colour: unknown key; allowed are flow, insecure, machines, nodes, results, rig, seed"
+    assert (
+        lines[0] == "2:1: colour: unknown key; allowed are flow, insecure, machines, nodes, results, rig, router, seed"
+    )
     assert lines[1] == "3:42: rig.hand_height: is 'tall'; it takes a number, above 0 (m, of the hand above ground)"
     assert re.match(r"5:14: nodes\.imu\.run: no program 'drivers\.nosuch' in .*drivers.*operators; ", lines[2])
     assert "there are drivers.bno055, drivers.doppler_adc" in lines[2]

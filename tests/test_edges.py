@@ -44,6 +44,13 @@ def test_every_row_is_looked_at_by_itself() -> None:
         assert alone[0] == edge
 
 
+def test_how_the_rows_lie_in_memory_does_not_matter() -> None:
+    rows = np.random.default_rng(5).random((9, 130)).astype(np.float32)
+    half = np.ascontiguousarray(rows[:, :65])
+    assert superior_edges(rows[:, :65]) == superior_edges(half)
+    assert superior_edges(np.asfortranarray(half)) == superior_edges(half)
+
+
 def test_flat_rows_and_falls_at_the_rim_give_no_nonsense() -> None:
     rows = np.zeros((4, 16), dtype=np.float32)
     rows[1] = 5

@@ -69,3 +69,16 @@ def test_window_is_the_newest_scans_in_order() -> None:
         window.push(np.full(3, k, dtype=np.complex64))
         expected = [max(i, 0) for i in range(k - 4, k + 1)]
         assert window.view().tolist() == [expected] * 3
+
+
+def test_window_gives_some_bins_to_be_kept() -> None:
+    rng = np.random.default_rng(6)
+    window = rd.SlowTimeWindow(length=5, bins=7)
+    bins = np.array([0, 2, 2, 6])
+    for _ in range(8):
+        window.push((rng.normal(size=7) + 1j * rng.normal(size=7)).astype(np.complex64))
+        before = window.view().copy()
+        kept = window.of(bins)
+        assert np.array_equal(kept, before[bins].T)
+        kept[:] = 0
+        assert np.array_equal(window.view(), before)

@@ -180,5 +180,8 @@ def _writing_to(path: Path | None) -> Iterator[TextIO]:
     if path is None:
         yield sys.stdout
     else:
-        with path.open("w", encoding="utf-8", newline="") as text:
-            yield text
+        try:
+            with path.open("w", encoding="utf-8", newline="") as text:
+                yield text
+        except OSError as error:  # a full disk names no file
+            raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error

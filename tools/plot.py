@@ -103,7 +103,10 @@ def command(
         raise CaneflowError(f"{output}: a picture is one of {', '.join(SUFFIXES)}")
     picture = read_picture(recording)
     figure = draw(picture)
-    figure.savefig(output, dpi=150)
+    try:
+        figure.savefig(output, dpi=150)
+    except OSError as error:  # a full disk names no file
+        raise CaneflowError(f"{output}: cannot be written: {error.strerror or error}") from error
     for line in summary(picture):
         print(line)
 

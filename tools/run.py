@@ -3,6 +3,7 @@
 import math
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.hosts.launch import Launcher, Outcome
 from caneflow.runtime.hosts.nursery import Nursery
+from caneflow.runtime.hosts.open_files import raise_limit, require_open_files
 from caneflow.runtime.wording import listed
 
 
@@ -74,31 +76,35 @@ def command(
 
     Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record out.mcap --set fusion.method=kalman
     """
-    nursery = None if in_process else Nursery()  # first: what is there now is there in every node
-    graph = load(file, settings or ())
-    for warning in graph.warnings:
-        print(warning, file=sys.stderr)
-    speed = speed or ("max" if in_process else "1")
-    played = _replay(replay, speed, start, duration, loop=loop, without=without or [])
-    recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
-    _check_machine(graph, machine, everything_here=in_process or played is not None)
-    deployment = deploy(
-        graph,
-        replay=played,
-        record=record,
-        recorder=recorder,
-        rig=_rig(rig),
-        machine=None if in_process else machine,
-    )
-    started = time.monotonic()
-    if nursery is None:
-        programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
-        outcome = InProcess(deployment, programs).run()
-    else:
-        restarts = {name: node.restart for name, node in graph.nodes.items()}
-        outcome = Launcher(deployment, restarts, report, nursery, keys or file.parent / "keys").run()
-    summary(deployment, outcome, time.monotonic() - started)
-    raise typer.Exit(outcome.status)
+    raise_limit()
+    # First: what is there now is there in every node.
+    with nullcontext() if in_process else Nursery() as nursery:
+        graph = load(file, settings or ())
+        for warning in graph.warnings:
+            print(warning, file=sys.stderr)
+        speed = speed or ("max" if in_process else "1")
+        played = _replay(replay, speed, start, duration, loop=loop, without=without or [])
+        recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
+        _check_machine(graph, machine, everything_here=in_process or played is not None)
+        deployment = deploy(
+            graph,
+            replay=played,
+            record=record,
+            recorder=recorder,
+            rig=_rig(rig),
+            machine=None if in_process else machine,
+        )
+        if nursery is not None:
+            require_open_files(sum(map(deployment.runs_here, deployment.plans)))
+        started = time.monotonic()
+        if nursery is None:
+            programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
+            outcome = InProcess(deployment, programs).run()
+        else:
+            restarts = {name: node.restart for name, node in graph.nodes.items()}
+            outcome = Launcher(deployment, restarts, report, nursery, keys or file.parent / "keys").run()
+        summary(deployment, outcome, time.monotonic() - started)
+        raise typer.Exit(outcome.status)
 
 
 def report(node: str, line: str) -> None:

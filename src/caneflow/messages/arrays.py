@@ -64,4 +64,7 @@ def from_bytes(data: memoryview) -> Array:
     expected = math.prod(shape) * dtype.itemsize
     if len(data) - offset != expected:
         raise MessageError(f"array of shape {shape} and dtype {dtype} has {len(data) - offset} bytes, not {expected}")
-    return np.ndarray(shape, dtype, data, offset)
+    try:
+        return np.ndarray(shape, dtype, data, offset)
+    except ValueError as error:  # no elements, but a size that no address has
+        raise MessageError(f"array of shape {shape}: {error}") from error

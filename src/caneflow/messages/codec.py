@@ -11,6 +11,7 @@ from caneflow.messages.errors import MessageError
 from caneflow.messages.samples import Sample
 
 MAX_PAYLOAD = 32 * 2**20  # bytes; a 4 MB frame is the largest that anybody asked for
+MAX_SEQ = 2**40  # 35 years at 1 kHz; what is counted as lost must fit into a message as well, however often
 MEDIA_TYPE = "application/msgpack"
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -33,7 +34,7 @@ def decode(payload: bytes, kind: type[S]) -> S:
         message: S = _decoder(kind).decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MessageError(str(error)) from error
-    if isinstance(message, Sample) and message.seq < 0:
+    if isinstance(message, Sample) and not 0 <= message.seq <= MAX_SEQ:
         raise MessageError(f"seq is {'missing' if message.seq == -1 else message.seq}; it counts 0, 1, 2 ...")
     return message
 

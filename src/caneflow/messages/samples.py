@@ -18,7 +18,7 @@ Vector3: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=0)]
-Stamp: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Stamp: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 2)]  # one more says that a stream has ended
 
 UNNUMBERED = -1  # a sample that no host has published yet
 UNIT_TOLERANCE = 1e-3  # how far a quaternion's norm may be from 1

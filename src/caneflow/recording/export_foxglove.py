@@ -37,15 +37,22 @@ def export_foxglove(source: Recording, output: Path) -> Counter[str]:
         writer = foxglove.open_mcap(output, allow_overwrite=True, context=context)
     except (OSError, RuntimeError) as error:
         raise RecordingError(f"{output}: cannot be written: {error}") from error
+    try:
+        with writer:
+            return _written(source, context)
+    except RuntimeError as error:  # a full disk, which shows when the file is ended
+        raise RecordingError(f"{output}: cannot be written: {error}") from error
+
+
+def _written(source: Recording, context: Any) -> Counter[str]:
     written: Counter[str] = Counter()
-    with writer:
-        writers: dict[str, Callable[[Recorded], int]] = {}
-        for sample in source.samples():
-            if sample.kind is not None:
-                topic = f"/{sample.node}/{sample.port}"
-                if topic not in writers:
-                    writers[topic] = _writer(sample, topic, context)
-                written[topic] += writers[topic](sample)
+    writers: dict[str, Callable[[Recorded], int]] = {}
+    for sample in source.samples():
+        if sample.kind is not None:
+            topic = f"/{sample.node}/{sample.port}"
+            if topic not in writers:
+                writers[topic] = _writer(sample, topic, context)
+            written[topic] += writers[topic](sample)
     return written
 
 

@@ -45,8 +45,9 @@ def export_rosbag2(source: Recording, output: Path) -> Counter[str]:
                     connections[topic] = bag.add_connection(topic, kind, typestore=store)
                 bag.write(connections[topic], stamp, store.serialize_cdr(message, kind))
                 written[topic] += 1
-    except WriterError as error:
-        raise RecordingError(f"{output}: cannot be written: {error}") from error
+    except (WriterError, OSError) as error:
+        cause = getattr(error, "strerror", None) or error
+        raise RecordingError(f"{output}: cannot be written: {cause}") from error
     except RecordingError:
         shutil.rmtree(output, ignore_errors=True)
         raise

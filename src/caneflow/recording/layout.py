@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import BinaryIO, TypeAlias
 
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, Metadata, MetadataIndex, Schema, Statistics
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
 
 MAGIC = MCAP0_MAGIC  # at the start and at the end of the file
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -24,6 +24,9 @@ FOOTER_LENGTH = RECORD.size + 20 + len(MAGIC)
 CHECKED_FOOTER = RECORD.size + 16  # bytes of the footer that its check sum covers
 MESSAGE = int(Opcode.MESSAGE)  # comparing with the enum's member takes as long as unpacking a message
 MAX_BARE = 2**20  # bytes of messages outside any chunk that are taken as one block
+# A chunk of ours has 256 kB and one message more, so 32 MiB at most; but 60 kB of a hostile file unpack to gigabytes.
+MAX_CHUNK = 2**26  # bytes, unpacked
+READ = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL}  # the others are not needed
 
 # Stamp, seq, log time; where in the block's data the payload starts and ends. Plain, as there are thousands.
 Entry: TypeAlias = tuple[int, int, int, int, int]
@@ -31,7 +34,7 @@ Entry: TypeAlias = tuple[int, int, int, int, int]
 # What mcap, its two decompressors and struct raise on bytes that are not what they should be.
 DAMAGE = (
     McapError,
-    ZstdError,
+    zstandard.ZstdError,
     struct.error,
     LookupError,
     MemoryError,
@@ -58,13 +61,15 @@ class Declarations:
     schemas: dict[int, Schema] = field(default_factory=dict)
 
     def note(self, opcode: int, body: bytes) -> None:
-        """Take in a record, if it declares something."""
+        """Take in a record, if it declares something; raises ValueError when it declares it otherwise than before."""
         if opcode == Opcode.CHANNEL:
             channel = Channel.read(_stream(body))
-            self.channels[channel.id] = channel
+            if self.channels.setdefault(channel.id, channel) != channel:
+                raise ValueError(f"channel {channel.id} is declared in two ways")
         elif opcode == Opcode.SCHEMA:
             schema = Schema.read(_stream(body))
-            self.schemas[schema.id] = schema
+            if self.schemas.setdefault(schema.id, schema) != schema:
+                raise ValueError(f"schema {schema.id} is declared in two ways")
 
 
 @dataclass
@@ -98,6 +103,8 @@ class Content:
             if at > end:
                 raise ValueError(f"a record reaches {at - end} bytes beyond its block")
             if opcode != MESSAGE:
+                if opcode not in READ:
+                    raise ValueError(f"a record of kind {opcode} among messages")
                 declared.note(opcode, data[body:at])
                 of_channel.clear()
                 continue
@@ -120,11 +127,9 @@ def layout_of(file: BinaryIO) -> Layout:
 
 def content_of(file: BinaryIO, block: Block, declared: Declarations) -> Content:
     """The messages of `block`. Raises one of DAMAGE when its bytes are not sound."""
-    file.seek(block.offset)
-    raw = file.read(block.length)
-    if len(raw) < block.length:
-        raise ValueError(f"{len(raw)} of {block.length} bytes are there")
-    content = Content(_unpacked(raw), declared)
+    if block.length > MAX_CHUNK:
+        raise ValueError(f"a chunk of {block.length} bytes; at most {MAX_CHUNK} are taken")
+    content = Content(_unpacked(_read_at(file, block.offset, block.length)), declared)
     if missing := block.topics - content.messages.keys():
         raise ValueError(f"no message of {', '.join(missing)}")
     return content
@@ -203,7 +208,10 @@ def _note(layout: Layout, opcode: int, body: bytes) -> None:
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
-    """Opcode, offset and bytes of every whole record; the footer only when the file goes on to its magic."""
+    """Opcode, offset and bytes of every whole record; the footer only when the file goes on to its magic.
+
+    Of a record that nobody needs, or that is too large for anything but damage, the bytes are its head alone.
+    """
     size = file.seek(0, 2)
     at = len(MAGIC)
     while at + RECORD.size <= size:
@@ -212,13 +220,22 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
         opcode, length = RECORD.unpack(head)
         if opcode == 0 or length > size - at - len(head):  # 0: what some file systems leave after a power cut
             return
-        raw = head + file.read(length)
-        if opcode == Opcode.FOOTER and file.read(len(MAGIC)) != MAGIC:
+        raw = head + file.read(length) if opcode in READ and length <= MAX_CHUNK else head
+        after = at + len(head) + length
+        if opcode == Opcode.FOOTER and (after + len(MAGIC) > size or _read_at(file, after, len(MAGIC)) != MAGIC):
             return
         yield opcode, at, raw
         if opcode == Opcode.FOOTER:
             return
-        at += len(raw)
+        at = after
+
+
+def _read_at(file: BinaryIO, offset: int, length: int) -> bytes:
+    """`length` bytes from `offset` on, which a damaged or hostile file may put anywhere; raises ValueError."""
+    if not 0 <= length <= file.seek(0, 2) - offset:
+        raise ValueError(f"{length} bytes from byte {offset} on are not there")
+    file.seek(offset)
+    return file.read(length)
 
 
 def _summarised(file: BinaryIO) -> Layout | None:
@@ -233,8 +250,7 @@ def _summarised(file: BinaryIO) -> Layout | None:
     footer = Footer.read(_stream(end[RECORD.size :]))
     if not len(MAGIC) <= footer.summary_start <= size - FOOTER_LENGTH:
         return None
-    file.seek(footer.summary_start)
-    summary = file.read(size - FOOTER_LENGTH - footer.summary_start)
+    summary = _read_at(file, footer.summary_start, size - FOOTER_LENGTH - footer.summary_start)
     if footer.summary_crc not in (0, zlib.crc32(end[:CHECKED_FOOTER], zlib.crc32(summary))):
         return None
     return _from_summary(file, summary)
@@ -255,8 +271,7 @@ def _from_summary(file: BinaryIO, summary: bytes) -> Layout | None:
             indexes.append(ChunkIndex.read(_stream(body)))
         elif opcode == Opcode.METADATA_INDEX:
             index = MetadataIndex.read(_stream(body))
-            file.seek(index.offset + RECORD.size)
-            _note(layout, Opcode.METADATA, file.read(index.length - RECORD.size))
+            _note(layout, Opcode.METADATA, _read_at(file, index.offset, index.length)[RECORD.size :])
         else:
             layout.declared.note(opcode, body)
     return None if statistics is None else _indexed(layout, statistics, indexes)
@@ -280,8 +295,29 @@ def _unpacked(raw: bytes) -> bytes:
     """The records in a block, whose bytes are one chunk or bare messages."""
     if raw[0] != Opcode.CHUNK:
         return raw
-    stream, length = get_chunk_data_stream(Chunk.read(_stream(raw[RECORD.size :])), validate_crc=True)
-    return stream.read(length)
+    chunk = Chunk.read(_stream(raw[RECORD.size :]))
+    if chunk.uncompressed_size > MAX_CHUNK:
+        raise ValueError(f"a chunk that unpacks to {chunk.uncompressed_size} bytes; at most {MAX_CHUNK} are taken")
+    data = _decompressed(chunk)
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError(f"a chunk of {len(data)} bytes; it says {chunk.uncompressed_size}")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("a chunk whose check sum is not that of its bytes")
+    return data
+
+
+def _decompressed(chunk: Chunk) -> bytes:
+    """What is in a chunk, as long as it is no longer than the chunk says."""
+    if chunk.compression == "zstd":
+        if zstandard.frame_content_size(chunk.data) > chunk.uncompressed_size:
+            raise ValueError("a chunk that unpacks to more than it says")
+        return zstandard.decompress(chunk.data, chunk.uncompressed_size)
+    if chunk.compression == "lz4":
+        unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size)
+        return unpacked
+    if chunk.compression:
+        raise ValueError(f"a chunk packed by {chunk.compression!r}")
+    return chunk.data
 
 
 def _stream(data: bytes) -> ReadDataStream:

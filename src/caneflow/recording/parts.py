@@ -87,7 +87,7 @@ class RotatingWriter:
         self._writer.close()
 
     def _begin_part_if_due(self, log_time: int) -> None:
-        if self._began is None:
+        if self._began is None or log_time < self._began:  # the clock was set back
             self._began = log_time
             return
         rotation = self._rotation
@@ -175,8 +175,8 @@ class LastSeconds:
     def _keep(self, kept: Kept) -> None:
         self._kept.append(kept)
         self._size += len(kept.payload)
-        oldest = kept.log_time - round(self.span_s * 1e9)
-        while self._kept[0].log_time < oldest:
+        span = round(self.span_s * 1e9)
+        while abs(kept.log_time - self._kept[0].log_time) > span:  # either way: the clock may be set
             self._forget()
         while self._size > self.largest and len(self._kept) > 1:
             self._forget()

@@ -20,6 +20,7 @@ from caneflow.recording.errors import RecordingError
 from caneflow.recording.layout import DAMAGE, MAGIC, Block, Content, Layout, content_of, layout_of
 
 TRUTH = ("truth", "pose")  # node and port of the ground truth, where there is any
+MAX_RIG_DEPTH = 16
 EXPECTED = "a recording is an MCAP file as `caneflow run --record` writes it"
 
 # Blocks by file and offset, while somebody reads them: a host in one process has a reader per source of the graph.
@@ -277,13 +278,26 @@ def _about(path: Path, layout: Layout) -> tuple[dict[str, str], dict[str, Any]]:
         if key not in layout.metadata.get(name, {}):
             cut = "" if layout.complete else ", it was cut before there was any"
             raise RecordingError(f"{path}: has no metadata record {name!r} with {key!r}{cut}; {EXPECTED}")
+    return layout.metadata["caneflow"], _rig_in(path, layout.metadata["rig"]["json"])
+
+
+def _rig_in(path: Path, text: str) -> dict[str, Any]:
     try:
-        rig = json.loads(layout.metadata["rig"]["json"])
-    except ValueError as error:
+        rig = json.loads(text)
+        json.dumps(rig, ensure_ascii=False).encode()  # half a surrogate pair is no text
+    except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: the rig in it is no JSON: {error}") from error
     if not isinstance(rig, dict):
-        raise RecordingError(f"{path}: the rig in it is {rig!r}; it is a map")
-    return layout.metadata["caneflow"], rig
+        raise RecordingError(f"{path}: the rig in it is no map, it is {text[:60]!r}")
+    if _is_deeper(rig, MAX_RIG_DEPTH):
+        raise RecordingError(f"{path}: the rig in it is nested more than {MAX_RIG_DEPTH} deep; that is no rig")
+    return rig
+
+
+def _is_deeper(value: object, depth: int) -> bool:
+    """Whether maps and lists are nested more than `depth` deep in `value`."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return depth < 0 or any(_is_deeper(each, depth - 1) for each in inside)
 
 
 def _damaged(path: Path, offset: int) -> str:

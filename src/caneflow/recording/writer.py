@@ -1,5 +1,6 @@
 """Writes a recording, so that a process killed at any instant leaves all but its last second behind."""
 
+import errno
 import json
 import uuid
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ FORMAT_VERSION = "1"  # of the layout of a recording; the program's own version 
 FLUSH_INTERVAL = 1_000_000_000  # ns of log time: what a killed recorder may lose
 # A second of the cane is 0.2 MB, so most chunks end with a flush; a burst ends here, for the reader's memory.
 CHUNK_SIZE = 256 * 1024  # bytes before compression
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MAX_SEQUENCE = 2**32 - 1  # MCAP's sequence is a uint32; a stream of 100 Hz gets there after 16 months
 
@@ -107,7 +109,7 @@ class RecordingWriter:
         self._mcap.add_message(channel, log_time, payload, stamp, seq & MAX_SEQUENCE)
         if self._flushed is None:
             self._flushed = log_time
-        elif log_time - self._flushed >= FLUSH_INTERVAL:
+        elif not 0 <= log_time - self._flushed < FLUSH_INTERVAL:  # below 0: the clock was set back
             self._flush()
             self._flushed = log_time
 
@@ -139,8 +141,10 @@ class RecordingWriter:
         except OSError as error:
             with suppress(OSError):  # closing flushes, which fails for the same reason
                 self._file.close()
+            advice = "; make room, or record on another disk" if error.errno in FULL else ""
             raise RecordingError(
                 f"{self.path}: {error.strerror or error}; the recording ends here, what was written before can be read"
+                f"{advice}"
             ) from error
 
 

@@ -21,6 +21,7 @@ from caneflow.runtime.wording import KeyPath, dotted, one_line, shown
 MAX_BYTES = 2**20  # a graph of hundreds of nodes has 100 kB
 MAX_DEPTH = 32  # mappings and lists inside each other
 MAX_VALUES = 50_000  # aliases of aliases may stand for more values than fit into memory
+MAX_BITS = 1024  # of a whole number: what no float holds, no setting takes
 
 TAG = "tag:yaml.org,2002:"
 MERGE = TAG + "merge"  # the key `<<`
@@ -143,11 +144,7 @@ class _Plain:
 
     def value(self, node: Node, path: KeyPath) -> Any:
         """The plain value of `node`."""
-        self._count += 1
-        if self._count > MAX_VALUES:
-            raise _TooMuch(f"stands for more than {MAX_VALUES} values; that is no dataflow")
-        if len(path) > MAX_DEPTH:
-            raise _TooMuch(f"is nested more than {MAX_DEPTH} deep; that is no dataflow")
+        self._count_one(len(path))
         self._document.places[path] = self._place(node)
         if id(node) in self._open:
             self._document.refuse(path, "contains itself; an alias may not lead to what it stands in")
@@ -156,6 +153,14 @@ class _Plain:
         plain = self._of_kind(node, path)
         self._open.discard(id(node))
         return plain
+
+    def _count_one(self, depth: int) -> None:
+        """Count a value that the text stands for, or that a merge brings."""
+        self._count += 1
+        if self._count > MAX_VALUES:
+            raise _TooMuch(f"stands for more than {MAX_VALUES} values; that is no dataflow")
+        if depth > MAX_DEPTH:
+            raise _TooMuch(f"is nested more than {MAX_DEPTH} deep; that is no dataflow")
 
     def _of_kind(self, node: Node, path: KeyPath) -> Any:
         if isinstance(node, MappingNode) and str(node.tag) == TAG + "map":
@@ -169,36 +174,43 @@ class _Plain:
 
     def _mapping(self, node: MappingNode, path: KeyPath) -> dict[str, Any]:
         plain: dict[str, Any] = {}
-        for key, item in self._pairs(node, path):
-            name = key.value if isinstance(key, ScalarNode) else "?"
-            inside = (*path, name)
+        for key, item in self._pairs(node):
+            name = _name_of(key)
             if name in plain:
-                self._twice(inside, key)
-                continue
-            self._document.key_places[inside] = self._place(key)
-            if str(key.tag) not in TEXTS or not _is_text(name):
-                self._document.refuse(inside, "is no key; a key is text, in quotes if need be", key=True)
-            plain[name] = self.value(item, inside)
+                self._twice((*path, name), key)
+            else:
+                plain[name] = self._item(key, item, (*path, name))
         for merged in self._merged(node, path):
-            for key, item in self._pairs(merged, path):
-                if isinstance(key, ScalarNode) and key.value not in plain:
-                    self._document.key_places[*path, key.value] = self._place(key)
-                    plain[key.value] = self.value(item, (*path, key.value))
+            for key, item in self._pairs(merged):
+                self._count_one(len(path))
+                if (name := _name_of(key)) not in plain:
+                    plain[name] = self._item(key, item, (*path, name))
         return plain
 
-    def _pairs(self, node: MappingNode, path: KeyPath) -> Iterator[tuple[Node, Node]]:
+    def _item(self, key: Node, item: Node, path: KeyPath) -> Any:
+        """The value of one entry of a mapping."""
+        self._document.key_places[path] = self._place(key)
+        if str(key.tag) not in TEXTS or not _is_text(key.value):
+            self._document.refuse(path, "is no key; a key is text, in quotes if need be", key=True)
+        return self.value(item, path)
+
+    def _pairs(self, node: MappingNode) -> Iterator[tuple[Node, Node]]:
         yield from ((key, item) for key, item in node.value if str(key.tag) != MERGE)
 
-    def _merged(self, node: MappingNode, path: KeyPath) -> Iterator[MappingNode]:
+    def _merged(self, node: MappingNode, path: KeyPath, within: tuple[int, ...] = ()) -> Iterator[MappingNode]:
+        """What `<<` brings in, and what is merged there in its turn; what comes first goes before what comes later."""
         for key, item in node.value:
             if str(key.tag) != MERGE:
                 continue
             for merged in item.value if isinstance(item, SequenceNode) else [item]:
-                if isinstance(merged, MappingNode):
+                self._count_one(len(path) + len(within))
+                if isinstance(merged, MappingNode) and id(merged) not in (id(node), *within):
                     yield merged
-                else:
-                    self._document.key_places[*path, "<<"] = self._place(key)
-                    self._document.refuse((*path, "<<"), "merges what is no mapping", key=True)
+                    yield from self._merged(merged, path, (*within, id(node)))
+                    continue
+                self._document.key_places[*path, "<<"] = self._place(key)
+                wrong = "merges itself" if isinstance(merged, MappingNode) else "merges what is no mapping"
+                self._document.refuse((*path, "<<"), wrong, key=True)
 
     def _scalar(self, node: ScalarNode, path: KeyPath) -> Any:
         tag = str(node.tag)
@@ -219,6 +231,9 @@ class _Plain:
             return None
         if isinstance(value, float) and math.isnan(value):
             self._document.refuse(path, "is not a number; nothing can be set to that")
+        if isinstance(value, int) and value.bit_length() > MAX_BITS:
+            self._document.refuse(path, "is a number that is too large for any setting")
+            return None
         return value
 
     def _twice(self, path: KeyPath, key: Node) -> None:
@@ -246,6 +261,12 @@ def _advice(said: str) -> str:
     if "expected a single document" in said or "another document" in said:
         return "; one file is one dataflow"
     return ""
+
+
+def _name_of(key: Node) -> str:
+    """A key as text, whatever it is."""
+    name = str(key.value) if isinstance(key, ScalarNode) else "?"
+    return name.encode(errors="backslashreplace").decode()
 
 
 def _is_text(text: str) -> bool:

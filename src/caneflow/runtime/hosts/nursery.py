@@ -43,7 +43,7 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
 
 
 class Nursery:
-    """The launcher's end: start nodes, and hear of their ends."""
+    """The launcher's end: start nodes, and hear of their ends; a context manager that leaves none."""
 
     def __init__(self) -> None:
         """Fork the nursery; to be done before this process has any thread."""
@@ -53,6 +53,12 @@ class Nursery:
             self._socket.close()
             _end(lambda: _Parent(inner).serve())
         inner.close()
+
+    def __enter__(self) -> "Nursery":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def start(self, arguments: Sequence[str], output: int) -> None:
         """Start what follows `python`; what it writes goes to the descriptor `output`. Started says its pid.

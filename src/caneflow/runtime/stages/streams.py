@@ -15,6 +15,8 @@ log = logging.getLogger(__name__)
 NOTES_KEPT = 10_000  # per stream, until a live host has told them
 AHEAD_KEPT = 20_000  # samples of one stream that may wait for what is missing before them
 CAUSES_NAMED = 100  # per stream: a hostile writer must not fill the memory
+SILENCE = 1_000_000_000  # ns from one stamp of a stream to the next that are worth a line
+SILENCES_NAMED = 10  # per stream: one that is slow is not to be complained of for ever
 
 
 @dataclass
@@ -36,6 +38,7 @@ class Arrivals:
     handled_stamp: int = BEGIN  # ns, likewise
     mark: PortMark | None = None  # of the writer, waiting for its last sample to arrive
     _named: set[str] = field(default_factory=set)
+    _silences: int = 0  # that were said
 
     def refuse(self, cause: object, kind: str = "") -> None:
         """Count a sample that cannot be taken; name the cause once per kind of cause."""
@@ -55,6 +58,8 @@ class Arrivals:
         """
         self.counts.received += 1
         if message.seq == self.expected and message.stamp > self.last_stamp and not (self.ahead or self.unreadable):
+            if message.stamp - self.last_stamp > SILENCE:
+                self._note_silence(message)
             self.expected, self.last_stamp = message.seq + 1, message.stamp  # as it should be, and nearly always is
             return [message]
         if message.stamp <= self.last_stamp or message.seq in self.ahead:
@@ -92,6 +97,7 @@ class Arrivals:
 
     def _next(self, message: Sample) -> Sample:
         # A smaller seq with a newer stamp is a writer that was restarted and counts anew.
+        self._note_silence(message)
         self.expected, self.unreadable = message.seq + 1, 0
         self.last_stamp = message.stamp
         return message
@@ -137,6 +143,15 @@ class Arrivals:
             self.left_out.append(
                 LeftOut(node=self.node, port=self.port, reason="lost", first_seq=self.expected, last_seq=before - 1)
             )
+
+    def _note_silence(self, message: Sample) -> None:
+        """Say how long nothing was measured, or what was is lost, before `message`."""
+        silent = message.stamp - self.last_stamp
+        if self.last_stamp == BEGIN or silent <= SILENCE or self._silences == SILENCES_NAMED:
+            return
+        self._silences += 1
+        last = " (not said again)" if self._silences == SILENCES_NAMED else ""
+        log.warning("%s: nothing for %.2f s before seq %d%s", self.plan.key, silent / 1e9, message.seq, last)
 
     def _say_once(self, kind: str, text: str) -> None:
         if kind not in self._named and len(self._named) < CAUSES_NAMED:
