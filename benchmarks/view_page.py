@@ -1,11 +1,14 @@
 """What the live page costs and how late it is: a real flow, the page in a real Chromium, a frozen tab.
 
 Run it as `python benchmarks/view_page.py WALK.mcap`; it needs the extra `view`, playwright and Debian's chromium.
-The page itself notes for each pose how long it took from its stamp to the end of the frame that shows it.
+The page itself notes for each pose how long it took from its stamp to the end of the frame that shows it. How busy the
+machine was is told beside it: flow and browser alone keep two cores two thirds busy, and what else runs on them adds to
+the latency.
 """
 
 import argparse
 import json
+import os
 import re
 import subprocess
 import sys
@@ -65,7 +68,9 @@ def measured(address: str, seconds: float) -> dict[str, Any]:
         page.goto(address)
         time.sleep(WARM_UP)
         page.evaluate("window.caneflow.latencies.length = 0")
+        idle, begin = idle_s(), time.monotonic()
         time.sleep(seconds)
+        busy = 1.0 - (idle_s() - idle) / (time.monotonic() - begin) / (os.cpu_count() or 1)
         latencies = sorted(page.evaluate("[...window.caneflow.latencies]"))
         before = counted()
         page.context.new_cdp_session(page).send("Page.setWebLifecycleState", {"state": "frozen"})
@@ -78,6 +83,8 @@ def measured(address: str, seconds: float) -> dict[str, Any]:
         "poses": len(latencies),
         "median_ms": round(1e3 * latencies[int(50 * share)], 1),
         "p99_ms": round(1e3 * latencies[int(99 * share)], 1),
+        "machine_busy_percent": round(100 * busy),
+        "load_average": os.getloadavg()[0],
         "lost_with_the_page": before["lost"],
         "lost_with_the_frozen_page": after["lost"] - before["lost"],
         "received_while_frozen": after["received"] - before["received"],
@@ -91,6 +98,12 @@ def thaw(page: Page) -> str:
     page.context.new_cdp_session(page).send("Page.setWebLifecycleState", {"state": "active"})
     time.sleep(3.0)
     return str(page.evaluate("document.getElementById('skipped').textContent"))
+
+
+def idle_s() -> float:
+    """Processor time, over all cores, in which nothing ran since the machine started."""
+    idle, waiting = Path("/proc/stat").read_text().split()[4:6]
+    return (int(idle) + int(waiting)) / os.sysconf("SC_CLK_TCK")
 
 
 def counted() -> dict[str, Any]:

@@ -187,6 +187,29 @@ def test_the_map_shows_a_target_where_it_is() -> None:
     assert np.isnan(picture.edges[-1])  # noise has no edge
 
 
+def test_a_running_flow_gives_its_map_beside_the_samples() -> None:
+    streams = LiveStreams(flow="cane", rig=Rig())
+    for frame in echo(0.6, 1.8):
+        streams.take("radar/frame", frame, received=0)
+    assert "pictures" not in told(streams.batch())
+    (picture,) = told(streams.picture())["pictures"]
+    assert picture["stream"] == "radar/frame"
+    assert picture["time"] == pytest.approx((SCANS - 1) * 1e-9)
+    assert picture["strongest"][0] == pytest.approx(1.8, abs=0.04)
+    assert streams.picture() is None, "not yet time for another"
+
+
+def test_scans_that_come_while_a_map_is_made_are_not_in_it() -> None:
+    window = RadarWindow()
+    first, *frames = echo(0.6, 1.8)
+    for frame in frames:
+        window.take(frame)
+    before = window.copy()
+    window.take(first)
+    assert before.picture() is None
+    assert window.picture() is not None
+
+
 def test_a_radar_of_another_make_begins_anew() -> None:
     window = RadarWindow()
     for frame in echo(0.6, 1.8):
@@ -305,6 +328,13 @@ def test_who_has_the_key_and_is_this_page_is_let_in(served: tuple[LiveStreams, A
     assert answered(served[1].port, upgrade(served[1])).startswith(b"HTTP/1.1 101")
 
 
+def test_nothing_is_compressed_for_a_page_on_the_same_machine(served: tuple[LiveStreams, Any]) -> None:
+    offer = "Sec-WebSocket-Extensions: permessage-deflate\r\n\r\n"
+    answer = answered(served[1].port, upgrade(served[1]).removesuffix("\r\n") + offer)
+    assert answer.startswith(b"HTTP/1.1 101")
+    assert b"permessage-deflate" not in answer
+
+
 @pytest.mark.parametrize(
     "wrong", [{"key": "guess"}, {"key": ""}, {"origin": "http://evil.example"}, {"host": "evil.example"}]
 )
@@ -348,6 +378,8 @@ class Torrent:
     def batch(self, *, watched: bool) -> bytes:
         self.given += watched
         return bytes(2**20)
+
+    def picture(self) -> None: ...
 
     def answer(self, request: dict[str, Any]) -> None: ...
 

@@ -251,6 +251,67 @@ def test_a_recording_is_scrubbed_to_the_very_sample(page: Page, tmp_path: Path) 
         viewing.communicate(timeout=DEADLINE)
 
 
+SPIKY = """async () => {
+  const { Series } = await import("./series.js");
+  const series = new Series("imu/imu", "Imu", ["gyro_x", "valid"]);
+  const times = Float64Array.from({ length: 10000 }, (_, i) => 0.01 * i + (i >= 6000 ? 5 : 0));
+  const rows = new Float64Array(20000);
+  for (let i = 0; i < 10000; i += 1) rows.set([Math.sin(i), 1], 2 * i);
+  rows[2 * 4321] = 9;
+  rows[2 * 4322] = -9;
+  for (let i = 2000; i < 2400; i += 1) rows[2 * i + 1] = 0;
+  series.append(times, rows, false);
+  const valid = (rows, at) => (rows[at + 1] ? rows[at] : NaN);
+  return series.between(0, 1000, [(rows, at) => rows[at], valid], 200);
+}"""
+
+
+def test_a_chart_of_many_samples_keeps_every_peak_and_every_gap(shown: tuple[Page, LiveStreams]) -> None:
+    page, _ = shown
+    times, drawn, valid = page.evaluate(SPIKY)
+    assert len(times) == len(drawn) == len(valid) <= 210
+    assert all(np.diff(times) > 0)
+    assert times[-1] == pytest.approx(0.01 * 9999 + 5), "up to the newest"
+    assert drawn.index(-9) - drawn.index(9) == 1, "in the order in which they came"
+    at = [time for time, value in zip(times, drawn, strict=True) if value is None]
+    assert at == pytest.approx([65.0], abs=1e-3), "the silence"
+    gap = [time for time, value in zip(times, valid, strict=True) if value is None and time < 60]
+    assert (min(gap), max(gap)) == (pytest.approx(20.0, abs=1.0), pytest.approx(24.0, abs=1.0))
+
+
+def remember_plan(page: Page) -> None:
+    page.evaluate("""() => {
+      const plan = document.getElementById("plan");
+      const pixels = () => plan.getContext("2d").getImageData(0, 0, plan.width, plan.height).data;
+      const before = pixels();
+      window.changed = () =>
+        pixels().reduce((sum, value, i) => sum + (Math.abs(value - before[i]) > 30), 0) / before.length;
+    }""")
+
+
+def test_a_track_that_was_drawn_bit_by_bit_looks_like_one_drawn_at_once(shown: tuple[Page, LiveStreams]) -> None:
+    page, streams = shown
+    page.keyboard.press("-")  # a scale that stays
+    for seq in range(100, 180):
+        walk(streams, seq, sd=0.1 + 0.004 * (seq - 100))
+        until(partial(has_come, page, seq))
+    page.keyboard.press("Space")
+    until(lambda: page.inner_text("#at-seq") == "at 3.58 s")
+    remember_plan(page)
+    page.select_option("#theme", "dark")
+    until(lambda: page.evaluate("window.changed()") > 0.5)
+    page.select_option("#theme", "light")
+    until(lambda: page.evaluate("window.changed()") < 0.01)
+
+
+def test_all_that_is_owed_is_drawn_when_nothing_comes_any_more(shown: tuple[Page, LiveStreams]) -> None:
+    page, streams = shown
+    walk(streams, 100)
+    until(lambda: page.inner_text("#time") == "2.00 s")
+    until(lambda: page.inner_text("#gyro-words") == "x 0.10, y 0.20, z 0.30 rad/s")
+    until(lambda: page.inner_text("#radar-words").startswith("strongest return"))
+
+
 def test_an_uncertain_position_is_said_to_be(shown: tuple[Page, LiveStreams]) -> None:
     page, streams = shown
     assert page.inner_text("#at-sure") == "±0.20 m"

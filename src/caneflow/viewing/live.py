@@ -1,4 +1,4 @@
-"""The samples of a running flow, gathered for the page: 20 times a second what is new, and what was before.
+"""The samples of a running flow, gathered for the page: in batches what is new, and what was before.
 
 Samples come on the node's thread, the page is served on another. Everything kept here is bounded.
 """
@@ -115,24 +115,32 @@ class LiveStreams:
             return [packets.packet("batch", origin=self._origin_s(), streams=streams)] if streams else []
 
     def batch(self, *, watched: bool = True) -> bytes:
-        """What is new; without the map unless somebody watches."""
+        """What is new but the map, whether somebody watches or not."""
         now = time.monotonic()
         values: dict[str, Any] = {"ended": self._ended}
         with self._lock:
             values["origin"] = self._origin_s()
             values["streams"] = {name: self._moved(s) for name, s in self._streams.items() if s.pending}
-            radars = dict(self._radars) if watched and now >= self._next_picture else {}
-            made = {name: self._picture(name, window) for name, window in radars.items()}
             if now >= self._next_traffic:
                 self._next_traffic = now + TRAFFIC_PERIOD
                 values["traffic"] = {name: _traffic(stream, now) for name, stream in self._streams.items()}
                 values["unheard"] = self._unheard
                 if self._status is not None:
                     values["status"] = packets.status(self._status.nodes, self._status.edges)
-        if radars:
-            self._next_picture = now + PICTURE_PERIOD
-        pictures = [packets.picture(name, drawn, self._origin or 0) for name, drawn in made.items() if drawn]
-        return packets.packet("batch", pictures=pictures, **values)
+        return packets.packet("batch", **values)
+
+    def picture(self) -> bytes | None:
+        """The maps, when it is time for new ones; samples can be taken meanwhile."""
+        now = time.monotonic()
+        if now < self._next_picture:
+            return None
+        self._next_picture = now + PICTURE_PERIOD
+        with self._lock:
+            origin = self._origin or 0
+            windows = {name: window.copy() for name, window in self._radars.items()}
+        made = {name: self._picture(name, window) for name, window in windows.items()}
+        pictures = [packets.picture(name, drawn, origin) for name, drawn in made.items() if drawn]
+        return packets.packet("pictures", pictures=pictures) if pictures else None
 
     def answer(self, request: dict[str, Any]) -> bytes | None:
         """A running flow has no answers: the page keeps what it was sent."""

@@ -55,6 +55,12 @@ class RadarWindow:
         self._scans.extend(frame.scans)
         del self._scans[:-SCANS]
 
+    def copy(self) -> "RadarWindow":
+        """The same scans, which do not change when this one takes more."""
+        window = RadarWindow()
+        window._scans, window._last = list(self._scans), self._last
+        return window
+
     def picture(self) -> RadarPicture | None:
         """The map of the newest SCANS scans; None while there are fewer, or for a pulse that they cannot hold."""
         frame = self._last

@@ -86,6 +86,10 @@ class RecordedStreams:
         self._given += 1
         return self._ready[self._given - 1]
 
+    def picture(self) -> bytes | None:
+        """A map is only made for an instant that is asked for."""
+        return None
+
     def answer(self, request: dict[str, Any]) -> bytes | None:
         """The samples at or before an instant, and the map there: for {"at": s since the recording's start}."""
         at = request.get("at")

@@ -28,8 +28,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from caneflow.errors import CaneflowError
 from caneflow.viewing.packets import packet
 
-BEAT = 0.05  # s between two batches
-MOST_WAITING = 20  # batches for one page: 1 s; beyond, the oldest are left out and counted
+BEAT = 0.03  # s between two batches
+MOST_WAITING = 33  # batches for one page: 1 s; beyond, the oldest are left out and counted
 MOST_ASKED = 4_096  # bytes of a page's request
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 FORBIDDEN = 4403  # close code of a websocket without the key
@@ -63,6 +63,10 @@ class Feed(Protocol):
 
     def batch(self, *, watched: bool) -> bytes | None:
         """What is new since the last one; `watched`: somebody looks."""
+        ...
+
+    def picture(self) -> bytes | None:
+        """What is new and takes long to make; asked for between two batches, when somebody looks."""
         ...
 
     def answer(self, request: dict[str, Any]) -> bytes | None:
@@ -118,7 +122,7 @@ class PageServer:
         self.address = f"http://127.0.0.1:{self.port}/#{self._key}"
         config = uvicorn.Config(
             _OnlyHere(self._application()), log_level="warning", ws="wsproto", ws_max_size=MOST_ASKED, access_log=False,
-            timeout_graceful_shutdown=1, lifespan="on",
+            ws_per_message_deflate=False, timeout_graceful_shutdown=1, lifespan="on",
         )  # fmt: skip
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
@@ -163,16 +167,21 @@ class PageServer:
                 await beat
 
     async def _beat(self) -> None:
-        """Offer each page what is new, 20 times a second."""
+        """Offer each page what is new, every BEAT."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
             due = max(due + BEAT, loop.time())  # after a pause there is nothing to catch up with
             await asyncio.sleep(due - loop.time())
-            batch = self._feed.batch(watched=bool(self._clients))
-            if batch is not None:
-                for client in self._clients:
-                    client.offer(batch)
+            self._offer(self._feed.batch(watched=bool(self._clients)))
+            await asyncio.sleep(BEAT / 2)  # the batch is on its way; what takes long holds up neither it nor the next
+            if self._clients:
+                self._offer(self._feed.picture())
+
+    def _offer(self, batch: bytes | None) -> None:
+        if batch is not None:
+            for client in self._clients:
+                client.offer(batch)
 
     async def _file(self, request: Request) -> Response:
         name = request.path_params.get("name", "index.html")

@@ -1,6 +1,6 @@
 // Time series, drawn by uPlot. Lines are told apart by colour, by dashes and by the letters at their ends.
 
-import { FONT, haloed, ink, STROKES } from "./ink.js";
+import { FONT, haloed, ink, sizeOf, STROKES, watch } from "./ink.js";
 
 /* global uPlot */
 
@@ -16,7 +16,7 @@ export class Chart {
     new IntersectionObserver(([entry]) => {
       this.visible = entry.isIntersecting;
     }).observe(holder);
-    new ResizeObserver(() => this.resize()).observe(holder);
+    watch(holder, () => this.resize());
   }
 
   build() {
@@ -30,8 +30,8 @@ export class Chart {
     const edges = band ? [{ label: "upper" }, { label: "lower" }].map((s) => ({ ...s, stroke: "transparent", points: { show: false } })) : [];
     this.plot = new uPlot(
       {
-        width: this.holder.clientWidth || 300,
-        height: this.holder.clientHeight || 160,
+        width: sizeOf(this.holder).width || 300,
+        height: sizeOf(this.holder).height || 160,
         legend: { show: false },
         cursor: { show: false },
         scales: {
@@ -60,22 +60,30 @@ export class Chart {
   }
 
   resize() {
-    if (this.plot && this.holder.clientWidth) {
-      this.plot.setSize({ width: this.holder.clientWidth, height: this.holder.clientHeight });
-    }
+    const { width, height } = sizeOf(this.holder);
+    if (this.plot && width) this.plot.setSize({ width, height });
   }
 
   draw(series, from, to, now) {
-    if (!this.visible || !series) return;
+    if (!this.visible) return;
     if (!this.plot) this.build();
     this.now = now;
-    const band = this.lines[0].band;
-    const columns = this.lines.map((line) => line.column);
-    const most = 2 * this.holder.clientWidth;
-    const data = series.between(from, to, band ? [...columns, band, "valid"] : columns, most);
+    const most = sizeOf(this.holder).width; // more than one point for a column of pixels is not seen
+    const data = series.between(from, to, this.values(series), most);
     this.plot.batch(() => {
-      this.plot.setData(band ? banded(data, columns.length) : data, false);
+      this.plot.setData(data, false);
       this.plot.setScale("x", { min: from, max: to });
+    });
+  }
+
+  // What is drawn of a row. Speeds that are not valid leave a gap; the band is the speed plus and minus its quality.
+  values({ index }) {
+    const [{ column, band }] = this.lines;
+    if (!band) return this.lines.map((line) => (rows, at) => rows[at + index[line.column]]);
+    const [value, width, valid] = [index[column], index[band], index.valid];
+    return [0, 1, -1].map((side) => (rows, at) => {
+      if (!rows[at + valid]) return NaN;
+      return side ? rows[at + value] + side * rows[at + width] : rows[at + value];
     });
   }
 
@@ -112,14 +120,4 @@ export class Chart {
     }
     context.restore();
   }
-}
-
-// Speeds that are not valid leave a gap; the band is the speed plus and minus its quality.
-function banded(data, count) {
-  const [times, ...columns] = data;
-  const [width, valid] = columns.slice(count);
-  const shown = columns[0].map((value, i) => (valid[i] ? value : null));
-  const upper = shown.map((value, i) => (value === null || width[i] === null ? null : value + width[i]));
-  const lower = shown.map((value, i) => (value === null || width[i] === null ? null : value - width[i]));
-  return [times, shown, ...columns.slice(1, count), upper, lower];
 }

@@ -22,20 +22,51 @@ export const STROKES = [
 
 export const FONT = '12px system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif';
 
-// The canvas's context, in CSS pixels, cleared; null while it is not laid out. `like`: of that one's size.
-export function begin(canvas, like = canvas) {
-  const { clientWidth: width, clientHeight: height } = like;
-  if (!width || !height) return null;
+const EXACT = "devicePixelContentBoxSize" in ResizeObserverEntry.prototype;
+const sizes = new WeakMap(); // of the elements that are watched
+const callbacks = new WeakMap();
+const observer = new ResizeObserver((entries) => {
+  for (const entry of entries) {
+    sizes.set(entry.target, sizeIn(entry));
+    callbacks.get(entry.target)();
+  }
+});
+
+function sizeIn({ contentRect: { width, height }, devicePixelContentBoxSize: exact }) {
   const ratio = window.devicePixelRatio || 1;
-  const wide = Math.round(width * ratio);
-  const high = Math.round(height * ratio);
+  const [wide, high] = exact ? [exact[0].inlineSize, exact[0].blockSize] : [width * ratio, height * ratio].map(Math.round);
+  return { width: Math.round(width), height: Math.round(height), wide, high };
+}
+
+// Know this element's size from now on, so that nobody has to ask for it while drawing: to ask lays out the page anew.
+export function watch(element, changed) {
+  callbacks.set(element, changed);
+  observer.observe(element, EXACT ? { box: "device-pixel-content-box" } : {});
+}
+
+// In CSS pixels, and as wide and high in those of the screen: a picture of just as many need not be scaled.
+export function sizeOf(element) {
+  return sizes.get(element) ?? sizeIn({ contentRect: { width: element.clientWidth, height: element.clientHeight } });
+}
+
+// The canvas's context, in CSS pixels, as empty as the card below; null while it is not laid out. `like`: of that
+// one's size; `clear`: see-through instead, which costs more to lay over the page.
+export function begin(canvas, { like = canvas, clear = false } = {}) {
+  const { wide, high } = sizeOf(like);
+  if (!wide || !high) return null;
+  const ratio = window.devicePixelRatio || 1;
+  const [width, height] = [wide / ratio, high / ratio];
   if (canvas.width !== wide || canvas.height !== high) {
     canvas.width = wide;
     canvas.height = high;
   }
-  const context = canvas.getContext("2d");
+  const context = canvas.getContext("2d", { alpha: clear });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.clearRect(0, 0, width, height);
+  if (clear) context.clearRect(0, 0, width, height);
+  else {
+    context.fillStyle = ink("card");
+    context.fillRect(0, 0, width, height);
+  }
   context.font = FONT;
   context.textBaseline = "middle";
   context.lineJoin = "round";

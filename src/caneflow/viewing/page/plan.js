@@ -1,11 +1,12 @@
 // The plan: where one is and was, which way one faces, and how sure that is.
 
-import { begin, decimals, haloed, ink, niceStep, STROKES } from "./ink.js";
+import { begin, decimals, haloed, ink, niceStep, STROKES, watch } from "./ink.js";
 import { SILENCE } from "./series.js";
 
 const UNSURE = 1.0; // m of the 2-sigma ellipse, from which on a position is called uncertain
 const CORRIDOR_STEP = 0.4; // semi-axes between two ellipses of the corridor
-const FIT = 2; // steps per m in which the whole is fitted
+const FIT = 0.5; // m: steps in which the whole is fitted, of a small one
+const WASTE = 0.7; // of what is shown is needed at least; below, the whole is fitted anew
 const PAST_PERIOD = 700; // ms
 const LEAST_SPAN = 4; // m that are shown at least
 
@@ -18,14 +19,22 @@ export class Plan {
     this.canvas = canvas;
     this.centre = [0, 0];
     this.scale = 60; // CSS pixels per m
+    this.box = null; // m: what is shown of the whole
+    this.bounds = new WeakMap(); // of each series: the box around its samples so far
     this.past = document.createElement("canvas"); // what does not change with every sample
+    this.trails = document.createElement("canvas"); // of it the trails; they grow at their ends
+    this.clouds = []; // and of each track the shape of all its ellipses
+    this.reached = []; // where each of them ends: samples, the last point and the last ellipse, pixels of trail
     this.pastKey = "";
     this.pastEnds = [];
     this.pastAt = 0;
     this.mode = "fit"; // fit: all of the track; follow: the position in the middle; free
     canvas.addEventListener("pointerdown", (event) => this.drag(event));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    watch(canvas, () => this.resized());
   }
+
+  resized() {}
 
   zoom(factor) {
     if (this.mode === "fit") this.mode = "free";
@@ -75,7 +84,7 @@ export class Plan {
     ];
     const strokes = strokesOf(tracks);
     this.drawPast(context, tracks, ends, strokes, room, width, height, place);
-    tracks.forEach((track, i) => this.trail(context, track, this.pastEnds[i] - 1, ends[i], strokes[i], place));
+    tracks.forEach((track, i) => this.trail(context, track, { ...this.reached[i] }, ends[i], strokes[i], place));
     tracks.forEach((track, i) => {
       const pose = track.series.sample(ends[i] - 1);
       if (!pose) return;
@@ -84,24 +93,42 @@ export class Plan {
     });
   }
 
-  // Grid, room, corridor and all of the trail but its end: kept as a picture, renewed when the view changes or now
-  // and then.
+  // Grid, room, corridor and all of the trail but its end: kept as a picture; what has come since is added now and
+  // then, and all of it is drawn anew when the view changes.
   drawPast(context, tracks, ends, strokes, room, width, height, place) {
     const key = [this.centre, this.scale, width, height, ink("ink"), ...tracks.map(({ series, shift }) => series.name + shift)].join();
-    const renewed = performance.now() - this.pastAt > PAST_PERIOD && ends.some((end, i) => end > this.pastEnds[i]);
-    if (key !== this.pastKey || renewed || ends.some((end, i) => end < this.pastEnds[i])) {
-      const { context: behind } = begin(this.past, this.canvas);
+    const anew = key !== this.pastKey || ends.some((end, i) => end < this.pastEnds[i]);
+    if (anew) this.forget(tracks);
+    if (anew || (performance.now() - this.pastAt > PAST_PERIOD && ends.some((end, i) => end > this.pastEnds[i]))) {
+      this.extend(tracks, ends, strokes, place);
+      const { context: behind } = begin(this.past, { like: this.canvas });
       this.grid(behind, width, height, place);
       this.room(behind, room, place);
-      tracks.forEach((track, i) => this.corridor(behind, track, ends[i], strokes[i], place));
-      tracks.forEach((track, i) => this.trail(behind, track, 0, ends[i], strokes[i], place));
+      behind.globalAlpha = 0.13;
+      tracks.forEach(({ truth }, i) => truth || copy(behind, this.clouds[i]));
+      behind.globalAlpha = 1;
+      copy(behind, this.trails);
       tracks.forEach((track, i) => this.beginning(behind, track, ends[i], strokes[i], place));
       [this.pastKey, this.pastEnds, this.pastAt] = [key, ends, performance.now()];
     }
-    context.save();
-    context.setTransform(1, 0, 0, 1, 0, 0);
-    context.drawImage(this.past, 0, 0);
-    context.restore();
+    copy(context, this.past);
+  }
+
+  forget(tracks) {
+    const clear = { like: this.canvas, clear: true };
+    begin(this.trails, clear);
+    tracks.forEach(({ truth }, i) => {
+      if (!truth) begin((this.clouds[i] ??= document.createElement("canvas")), clear);
+    });
+    this.reached = tracks.map(() => ({ samples: 0, point: null, ellipse: null, length: 0 }));
+  }
+
+  // Add what has come to the trails and to the clouds.
+  extend(tracks, ends, strokes, place) {
+    tracks.forEach((track, i) => {
+      if (!track.truth) this.corridor(this.clouds[i].getContext("2d"), track, this.reached[i], ends[i], strokes[i], place);
+      this.trail(this.trails.getContext("2d"), track, this.reached[i], ends[i], strokes[i], place);
+    });
   }
 
   look(tracks, ends, room, width, height) {
@@ -111,12 +138,35 @@ export class Plan {
       if (pose) this.centre = [pose.x, pose.y];
     }
     if (this.mode !== "fit") return;
-    const box = boxOf(tracks, ends, room);
-    const [left, right] = [Math.floor(box[0] * FIT) / FIT, Math.ceil(box[1] * FIT) / FIT]; // in steps: no creeping
-    const [low, high] = [Math.floor(box[2] * FIT) / FIT, Math.ceil(box[3] * FIT) / FIT];
+    this.box = fitted(this.box, this.whole(tracks, ends, room));
+    const [left, right, low, high] = this.box;
     const span = [Math.max(right - left, LEAST_SPAN), Math.max(high - low, LEAST_SPAN * 0.6)];
     this.centre = [(left + right) / 2, (low + high) / 2];
     this.scale = Math.min((width - 90) / span[0], (height - 80) / span[1]);
+  }
+
+  // The box around the room, the tracks, and the ellipses at their ends.
+  whole(tracks, ends, room) {
+    const box = room.area ? [...room.area] : [Infinity, -Infinity, Infinity, -Infinity];
+    for (const [x, y] of Object.values(room.sensors || {})) widen(box, x, y, 0.3);
+    tracks.forEach(({ series, shift: [dx, dy] }, i) => {
+      const [left, right, low, high] = this.around(series, ends[i]);
+      widen(box, left + dx, low + dy, 0);
+      widen(box, right + dx, high + dy, 0);
+      const pose = series.sample(ends[i] - 1);
+      if (pose) widen(box, pose.x + dx, pose.y + dy, Math.min(pose.major || 0, 20));
+    });
+    return box[0] <= box[1] ? box : [-2, 2, -2, 2];
+  }
+
+  // The box around the first `end` samples; only those are looked at that have come since.
+  around(series, end) {
+    let known = this.bounds.get(series);
+    if (!known || end < known.end) known = { end: 0, box: [Infinity, -Infinity, Infinity, -Infinity] };
+    for (let i = known.end; i < end; i += 1) widen(known.box, series.rows[i * series.width], series.rows[i * series.width + 1], 0);
+    known.end = end;
+    this.bounds.set(series, known);
+    return known.box;
   }
 
   grid(context, width, height, place) {
@@ -182,48 +232,44 @@ export class Plan {
     }
   }
 
-  // All places where one may have been, as one shape: it widens as the position becomes uncertain.
-  corridor(context, { series, truth }, end, stroke, place) {
-    if (truth) return;
-    context.save();
+  // All places where one may have been, as one shape: it widens as the position becomes uncertain. Opaque: what shines
+  // through is the picture of all of them.
+  corridor(context, { series }, reached, end, stroke, place) {
     context.fillStyle = ink(stroke.colour);
-    context.globalAlpha = 0.13;
-    context.beginPath();
-    let last = null;
-    for (let i = 0; i < end; i += 1) {
+    for (let i = reached.samples; i < end; i += 1) {
       const at = i * series.width;
-      const [x, y] = [series.rows[at], series.rows[at + 1]];
-      const [major, minor, turn] = [series.rows[at + 7], series.rows[at + 8], series.rows[at + 9]];
-      const far = last === null || Math.hypot(x - last[0], y - last[1]) > Math.max(1.5 / this.scale, CORRIDOR_STEP * minor);
-      if (!Number.isFinite(major) || !(far || i === end - 1)) continue;
-      last = [x, y];
-      ellipse(context, place(x, y), major * this.scale, minor * this.scale, turn);
+      const [x, y, major, minor] = [series.rows[at], series.rows[at + 1], series.rows[at + 7], series.rows[at + 8]];
+      if (!Number.isFinite(major)) continue;
+      const step = Math.max(1.5 / this.scale, CORRIDOR_STEP * minor);
+      if (i < end - 1 && reached.ellipse && Math.hypot(x - reached.ellipse[0], y - reached.ellipse[1]) <= step) continue;
+      reached.ellipse = [x, y];
+      context.beginPath();
+      ellipse(context, place(x, y), major * this.scale, minor * this.scale, series.rows[at + 9]);
+      context.fill();
     }
-    context.fill("nonzero");
-    context.restore();
   }
 
-  trail(context, { series, truth, shift }, from, end, stroke, place) {
-    if (end - from < 2) return;
-    const at = (i) => place(series.rows[i * series.width] + shift[0], series.rows[i * series.width + 1] + shift[1]);
+  // The track from where it was drawn to; dashes go on where they were.
+  trail(context, { series, truth, shift }, reached, end, stroke, place) {
     context.save();
     context.strokeStyle = ink(stroke.colour);
     context.setLineDash(stroke.dash);
+    context.lineDashOffset = reached.length;
     context.lineWidth = truth ? 3 : 2;
     context.beginPath();
-    let last = [Infinity, Infinity];
+    if (reached.point) context.moveTo(...reached.point);
     const silence = Math.max(SILENCE, 3 * series.spacing);
-    for (let i = Math.max(from, 0); i < end; i += 1) {
-      const next = at(i);
-      if (i > from && i > 0 && series.times[i] - series.times[i - 1] > silence) {
-        context.moveTo(...next);
-        last = next;
-        continue;
-      }
-      if (i < end - 1 && Math.abs(next[0] - last[0]) + Math.abs(next[1] - last[1]) < 1.5) continue; // one pixel
-      context.lineTo(...next);
-      last = next;
+    for (let i = reached.samples; i < end; i += 1) {
+      const [x, y] = place(series.rows[i * series.width] + shift[0], series.rows[i * series.width + 1] + shift[1]);
+      const apart = !reached.point || series.times[i] - series.times[i - 1] > silence;
+      const way = apart ? 0 : Math.hypot(x - reached.point[0], y - reached.point[1]);
+      if (!apart && i < end - 1 && way < 1.2) continue; // one pixel
+      if (apart) context.moveTo(x, y);
+      else context.lineTo(x, y);
+      reached.length += way;
+      reached.point = [x, y];
     }
+    reached.samples = Math.max(reached.samples, end);
     context.stroke();
     context.restore();
   }
@@ -330,19 +376,28 @@ function arrow(context, x, y, yaw, colour, hollow) {
   context.restore();
 }
 
-function boxOf(tracks, ends, room) {
-  let box = room.area ? [...room.area] : [Infinity, -Infinity, Infinity, -Infinity];
-  const add = (x, y, around) => {
-    box = [Math.min(box[0], x - around), Math.max(box[1], x + around), Math.min(box[2], y - around), Math.max(box[3], y + around)];
-  };
-  for (const [x, y] of Object.values(room.sensors || {})) add(x, y, 0.3);
-  tracks.forEach(({ series, shift: [dx, dy] }, i) => {
-    const step = Math.max(1, Math.floor(ends[i] / 1000));
-    for (let n = 0; n < ends[i]; n += step) add(series.rows[n * series.width] + dx, series.rows[n * series.width + 1] + dy, 0);
-    const pose = series.sample(ends[i] - 1);
-    if (pose) add(pose.x + dx, pose.y + dy, Math.min(pose.major || 0, 20));
-  });
-  return Number.isFinite(box[0]) ? box : [-2, 2, -2, 2];
+// What is shown of the whole: `needed` in steps, so that it does not creep, and as before while that fits well.
+function fitted(before, needed) {
+  const inside = before && needed.every((side, i) => (i % 2 ? side <= before[i] : side >= before[i]));
+  const span = (box) => Math.max(box[1] - box[0], box[3] - box[2], LEAST_SPAN);
+  if (inside && span(needed) > WASTE * span(before)) return before;
+  const step = FIT * 2 ** Math.floor(Math.log2(span(needed) / LEAST_SPAN));
+  return needed.map((side, i) => (i % 2 ? Math.ceil(side / step) : Math.floor(side / step)) * step);
+}
+
+function widen(box, x, y, around) {
+  if (x - around < box[0]) box[0] = x - around;
+  if (x + around > box[1]) box[1] = x + around;
+  if (y - around < box[2]) box[2] = y - around;
+  if (y + around > box[3]) box[3] = y + around;
+}
+
+// Lay a picture of the same size over it, pixel on pixel.
+function copy(context, picture) {
+  context.save();
+  context.setTransform(1, 0, 0, 1, 0, 0);
+  context.drawImage(picture, 0, 0);
+  context.restore();
 }
 
 function tidy(number, places) {

@@ -1,6 +1,6 @@
 // The range-Doppler map with its superior edge.
 
-import { begin, decimals, haloed, ink, niceStep } from "./ink.js";
+import { begin, decimals, ink, niceStep, watch } from "./ink.js";
 
 // Dark to light in even steps of brightness, told apart by the colour-blind too (cividis).
 const STOPS = [
@@ -28,7 +28,10 @@ export class RadarMap {
     new IntersectionObserver(([entry]) => {
       this.visible = entry.isIntersecting;
     }).observe(canvas);
+    watch(canvas, () => this.resized());
   }
+
+  resized() {}
 
   draw(picture) {
     const opened = begin(this.canvas);

@@ -72,29 +72,44 @@ export class Series {
     return named(this, this.times[number], values);
   }
 
-  // Times and the columns of that name between two times, with one sample more on either side; after a silence there
-  // is an empty point, so that no line is drawn over it.
-  between(from, to, columns, most = 4000) {
+  // Times between two times, with one sample more on either side, and what each of `values` gives there: functions of
+  // the rows and where a row begins. Where there are more than `most`, the least and the greatest of so many samples
+  // stand for them, so that no peak is lost; after a silence there is an empty point, so that no line is drawn over it.
+  between(from, to, values, most = 4000) {
     const begin = Math.max(0, this.upTo(from) - 1);
     const end = Math.min(this.length, this.upTo(to) + 1);
-    const step = Math.max(1, Math.ceil((end - begin) / most));
+    const step = Math.ceil((end - begin) / most);
+    const size = step > 1 ? 2 * step : 1;
     const times = [];
-    const found = columns.map(() => []);
-    const places = columns.map((column) => this.index[column]);
-    const silence = Math.max(SILENCE, 3 * step * this.spacing);
-    for (let at = begin; at < end; at += step) {
-      const time = this.times[at];
-      if (times.length && time - times[times.length - 1] > silence) {
-        times.push(time - 1e-6);
+    const found = values.map(() => []);
+    const silence = Math.max(SILENCE, 3 * this.spacing);
+    for (let at = begin; at < end; ) {
+      if (at > begin && this.times[at] - this.times[at - 1] > silence) {
+        times.push(this.times[at] - 1e-6);
         for (const column of found) column.push(null);
       }
-      times.push(time);
-      for (let c = 0; c < places.length; c += 1) {
-        const number = this.rows[at * this.width + places[c]];
-        found[c].push(Number.isFinite(number) ? number : null);
-      }
+      const last = Math.min(end, (Math.floor(at / size) + 1) * size); // the same samples together in each drawing
+      let next = at + 1;
+      while (next < last && this.times[next] - this.times[next - 1] <= silence) next += 1;
+      times.push(this.times[at]);
+      if (next - at > 1) times.push(this.times[next - 1]);
+      values.forEach((value, i) => this.extremes(value, at, next, found[i]));
+      at = next;
     }
     return [times, ...found];
+  }
+
+  // The least and the greatest value of the samples from `begin` on, before `end`, in the order in which they come.
+  extremes(value, begin, end, into) {
+    let [least, most, leastAt, mostAt] = [Infinity, -Infinity, 0, 0];
+    for (let at = begin; at < end; at += 1) {
+      const number = value(this.rows, at * this.width);
+      if (Number.isFinite(number) && number < least) [least, leastAt] = [number, at];
+      if (Number.isFinite(number) && number > most) [most, mostAt] = [number, at];
+    }
+    const known = least <= most;
+    into.push(known ? (leastAt <= mostAt ? least : most) : null);
+    if (end - begin > 1) into.push(known ? (leastAt <= mostAt ? most : least) : null);
   }
 }
 

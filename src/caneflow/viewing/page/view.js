@@ -14,7 +14,10 @@ const STALE = 1.5; // s without a new position, from which on it is said
 const RETRY = 1000; // ms between two attempts to connect
 const CALM_DRAWING = 500; // ms between two drawings when reduced motion is wanted
 const CALM_SCRUBBING = 700; // ms between two sentences while the time cursor is moved by hand
-const BUDGET = 5; // ms of one frame for charts and map; what does not fit is drawn in the next
+const LONG_FRAME = 8; // ms that a frame may take in the mean; if longer, fewer charts are drawn with each
+const SHORT_FRAME = 4; // ms, below which there may be more
+const SMOOTHING = 0.1; // of that mean
+const MOST_TURNS = 100;
 const MOST_COSTS = 1000;
 const MOST_LATENCIES = 20_000;
 
@@ -36,13 +39,17 @@ const edges = new Table($("edges"), 10);
 let state = fresh();
 let socket = null;
 let dirty = false;
+let shownUnsure = false;
 let lastDrawn = 0;
 let lastSaid = 0;
 let turn = 0; // whose turn it is to be drawn
-let left = 0; // how many were not drawn in the last frame
+let owed = 0; // how many of the charts and the map have not been drawn since something changed
+let share = 1; // how many of them are drawn with each frame
+let frame = LONG_FRAME; // ms that a frame takes, in the mean
 let undrawn = []; // of a live flow: stamps of the poses that have come since the last drawing, s of the epoch
 const latencies = []; // s from a pose's stamp to the end of the frame that shows it
 const costs = []; // ms of the last drawings
+const shownWords = {}; // by id: what was put there last
 
 function fresh() {
   return {
@@ -94,13 +101,17 @@ function connection(className, words) {
 function take(message) {
   if (message.kind === "hello") takeHello(message);
   else if (message.kind === "batch") takeBatch(message);
+  else if (message.kind === "pictures") takePictures(message);
   else if (message.kind === "at") takeAnswer(message);
   else if (message.kind === "skipped") {
     $("skipped").textContent = `⚠ This page was too slow for ${message.batches} batches.`;
   } else if (message.kind === "read" && message.problem) {
     $("trouble").textContent = message.problem;
   }
-  touch();
+  const samples = message.kind !== "batch" || Object.keys(message.streams ?? {}).length > 0;
+  if (message.kind === "pictures") owed = MOST_TURNS; // it is drawn with the next batch
+  else if (samples) touch();
+  else if (owed) again();
 }
 
 function takeHello(hello) {
@@ -140,14 +151,17 @@ function takeBatch(batch) {
     if (times.length) state.cameAt = performance.now();
     if (batch.ended !== undefined) for (const time of times) undrawn.push(batch.origin + time); // not what was before
   }
-  for (const picture of batch.pictures ?? []) state.pictures.push(opened(picture));
-  if (state.pictures.length > MOST_PICTURES) state.pictures.splice(0, MOST_PICTURES / 4);
   if (batch.traffic) showTables(batch);
   if (!endless) edges.show([...state.series.values()].map(recordedRow));
   if (batch.ended && !state.ended) {
     state.ended = true;
     connection("wait", "■ the flow has ended");
   }
+}
+
+function takePictures({ pictures }) {
+  state.pictures.push(...pictures.map(opened));
+  if (state.pictures.length > MOST_PICTURES) state.pictures.splice(0, MOST_PICTURES / 4);
 }
 
 function seriesOf(name, sent) {
@@ -253,7 +267,7 @@ function sampleAt(series) {
   return series.sample(series.upTo(now()) - 1);
 }
 
-// What costs time to draw, each at most so often: the plan and all numbers come first, with every batch.
+// What costs time to draw: it takes turns, while the plan and all numbers come with every batch.
 function drawing() {
   const time = now();
   const span = Number($("span").value);
@@ -261,34 +275,33 @@ function drawing() {
   const from = to - span;
   const ground = first("GroundSpeed");
   const imu = first("Imu");
-  const shown = (chart, series, words) => () => {
-    chart.draw(series, from, to, time);
-    if (series) words(sampleAt(series));
+  const turns = state.cursor === null ? [showTime] : [];
+  const show = (chart, series, words) => {
+    if (!series) return;
+    turns.push(() => {
+      chart.draw(series, from, to, time);
+      words(sampleAt(series));
+    });
   };
-  const turns = [
-    shown(charts.speed, ground, speedInWords),
-    showPicture,
-    shown(charts.gyro, imu, imuInWords),
-    shown(charts.accel, imu, () => {}),
-    showTime,
-  ];
+  show(charts.speed, ground, speedInWords);
+  if (first("RadarFrame")) turns.push(showPicture);
+  show(charts.gyro, imu, imuInWords);
+  show(charts.accel, imu, () => {});
   for (const [name, target] of targetCharts) {
-    turns.push(shown(target.chart, state.series.get(name) ?? null, (sample) => targetInWords(name, target, sample)));
+    show(target.chart, state.series.get(name), (sample) => targetInWords(name, target, sample));
   }
   return turns;
 }
 
-// Draw as many as there is time for, going on where the last frame left off.
+// Draw as many as there is time for in a frame, going on where the last one left off.
 function drawInTurns() {
   const turns = drawing();
-  const begin = performance.now();
-  let drawn = 0;
-  do {
-    turns[turn % turns.length]();
-    turn += 1;
-    drawn += 1;
-  } while (drawn < turns.length && performance.now() - begin < BUDGET);
-  left = turns.length - drawn;
+  const count = still.matches ? turns.length : Math.min(owed, share, turns.length);
+  for (let i = 0; i < count; i += 1) {
+    turn = (turn + 1) % turns.length;
+    turns[turn]();
+  }
+  owed = Math.max(0, Math.min(owed, turns.length) - count);
 }
 
 function draw() {
@@ -300,6 +313,7 @@ function draw() {
   const speed = ground ? sampleAt(ground) : null;
   plan.draw(found, state.hello ?? {}, now(), stale);
   showNumbers(pose, speed, primary, stale);
+  if (state.cursor !== null) showTime(); // somebody moves it
   drawInTurns();
 }
 
@@ -310,8 +324,8 @@ function staleness(primary) {
 }
 
 function put(id, words) {
-  const place = $(id);
-  if (place.textContent !== words) place.textContent = words;
+  if (shownWords[id] === words) return;
+  $(id).textContent = shownWords[id] = words;
 }
 
 function showNumbers(pose, speed, primary, stale) {
@@ -319,17 +333,21 @@ function showNumbers(pose, speed, primary, stale) {
   put("at-y", pose ? `${number(pose.y)} m` : "–");
   put("at-yaw", pose ? degrees(pose.yaw) : "–");
   put("at-sure", !pose ? "–" : Number.isFinite(pose.major) ? `±${number(pose.major)} m` : "not known");
-  $("at-sure").className = pose && isUnsure(pose) ? "unsure" : "";
+  const unsure = Boolean(pose && isUnsure(pose));
+  if (unsure !== shownUnsure) $("at-sure").classList.toggle("unsure", (shownUnsure = unsure));
   put("at-speed", speed ? (speed.valid ? `${number(speed.speed)} m/s` : "not valid") : pose ? `${number(Math.hypot(pose.vx, pose.vy))} m/s` : "–");
   put("at-quality", speed?.valid ? `±${number(speed.quality)} m/s` : "–");
   put("at-seq", primary && state.cursor === null && primary.series.lastSeq !== null ? String(primary.series.lastSeq) : pose ? `at ${number(pose.time)} s` : "–");
   const calm = Number($("calm").value);
-  $("words").setAttribute("aria-live", calm ? "polite" : "off");
   const waited = performance.now() - lastSaid;
   const moved = state.cursor !== null && !state.playing && state.cursor !== state.saidAt; // by hand: soon
   const due = lastSaid === 0 || waited > 1000 * (calm || 2) || (moved && waited > CALM_SCRUBBING);
   if (primary && pose && due) say(pose, primary, speed, stale);
   else if (moved) soon();
+}
+
+function showCalm() {
+  $("words").setAttribute("aria-live", Number($("calm").value) ? "polite" : "off");
 }
 
 function soon() {
@@ -361,12 +379,13 @@ function imuInWords(imu) {
 function targetInWords(name, { words, holder }, target) {
   if (!target) return;
   const valid = target.valid ? "" : ", not valid";
-  words.textContent = `${name}: ${number(target.range_rate)} m/s, ${number(target.snr, 0)} dB${valid}`;
-  holder.setAttribute("aria-label", `Doppler target ${words.textContent}`);
+  const said = `${name}: ${number(target.range_rate)} m/s, ${number(target.snr, 0)} dB${valid}`;
+  if (words.textContent === said) return;
+  words.textContent = said;
+  holder.setAttribute("aria-label", `Doppler target ${said}`);
 }
 
 function showPicture() {
-  if ($("radar-card").hidden) return;
   let picture = null;
   if (state.hello.source === "recording") picture = state.at?.pictures[0] ?? null;
   else {
@@ -402,6 +421,12 @@ function showPause() {
 
 // Something has changed: draw with the next frame. Without changes there are no frames.
 function touch() {
+  owed = MOST_TURNS;
+  again();
+}
+
+// Draw what is still owed with the next frame.
+function again() {
   if (dirty) return;
   dirty = true;
   requestAnimationFrame(tick);
@@ -422,8 +447,9 @@ function tick(at) {
   draw();
   costs.push(performance.now() - begin);
   if (costs.length > MOST_COSTS) costs.shift();
-  measure();
-  if (state.playing || (left && state.cursor !== null)) touch(); // the rest, when nothing comes any more
+  measure(begin);
+  if (state.playing) touch();
+  else if (owed && state.cursor !== null) again(); // the rest, when nothing comes any more
 }
 
 function play(at) {
@@ -444,19 +470,26 @@ function ask() {
   socket.send(JSON.stringify({ at: state.cursor }));
 }
 
-// How long the samples took that have just been drawn: taken after the frame has been handed on.
-function measure() {
-  if (!undrawn.length || state.hello.source !== "live") return;
-  const drawn = undrawn;
+// How long the frame took, and the samples that have just been drawn: taken after the frame has been handed on.
+function measure(begin) {
+  const drawn = state.cursor === null && state.hello.source === "live" ? undrawn : [];
   undrawn = [];
-  if (state.cursor !== null) return;
   const channel = new MessageChannel();
   channel.port1.onmessage = () => {
-    const seen = (performance.timeOrigin + performance.now()) / 1000;
+    const end = performance.now();
+    budget(end - begin);
+    const seen = (performance.timeOrigin + end) / 1000;
     for (const taken of drawn) latencies.push(seen - taken);
     if (latencies.length > MOST_LATENCIES) latencies.splice(0, latencies.length - MOST_LATENCIES);
   };
   channel.port2.postMessage(null);
+}
+
+// More charts with each frame while frames are short, fewer when they are long: position and numbers come first.
+function budget(took) {
+  frame += SMOOTHING * (took - frame);
+  if (frame > LONG_FRAME && share > 1) share -= 1;
+  else if (frame < SHORT_FRAME && share < MOST_TURNS) share += 1;
 }
 
 function showLatency() {
@@ -517,7 +550,7 @@ function sayNow() {
   const pose = primary ? sampleAt(primary.series) : null;
   const ground = first("GroundSpeed");
   if (!pose) return;
-  $("words").textContent = ""; // so that the same words are said again
+  put("words", ""); // so that the same words are said again
   say(pose, primary, ground ? sampleAt(ground) : null, staleness(primary));
 }
 
@@ -567,6 +600,11 @@ function theme() {
 }
 
 plan.changed = showMode;
+plan.resized = touch;
+radar.resized = () => {
+  state.drawn = undefined;
+  touch();
+};
 $("pause").onclick = pause;
 $("newest").onclick = newest;
 $("cursor").oninput = () => hold(Number($("cursor").value));
@@ -580,9 +618,8 @@ $("primary").onchange = () => {
   lastSaid = 0;
   touch();
 };
-$("calm").onchange = $("span").onchange = () => {
-  touch();
-};
+$("calm").onchange = showCalm;
+$("span").onchange = touch;
 $("theme").onchange = theme;
 dark.addEventListener("change", theme);
 addEventListener("keydown", onKey);
@@ -593,6 +630,7 @@ new ResizeObserver(() => {
 setInterval(showLatency, 1000);
 
 theme();
+showCalm();
 connect();
 setInterval(() => {
   if (state.hello && state.cursor === null && performance.now() - state.cameAt > 1000 * STALE) touch(); // it grows old
