@@ -18,6 +18,7 @@ class Background:
         self._time_constant = time_constant
         self._mean: NDArray[np.float32] | None = None  # real and imaginary parts in turn
         self._weight = 0.0  # sum of exp(-age / time constant) over the scans seen
+        self._share = np.empty((), np.float32)  # 1 / weight, of the type it scales: no casts
 
     def remove(self, scan: NDArray[np.complex64], elapsed: float) -> None:
         """Take the mean of the past and itself off `scan`, shape (M,), in place; nothing is left of the first one.
@@ -30,6 +31,7 @@ class Background:
             self._mean = np.zeros_like(parts)
         self._weight = self._weight * math.exp(-elapsed / self._time_constant) + 1.0
         parts -= self._mean
-        step = parts * (1.0 / self._weight)
+        self._share[()] = 1.0 / self._weight
+        step = parts * self._share
         self._mean += step
         parts -= step

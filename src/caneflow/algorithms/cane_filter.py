@@ -298,12 +298,13 @@ class CaneFilter:
         turn = cmath.rect(1.0, heading.yaw)
         velocity = turn * complex(*self._motion.velocity)
         rise = self._heave.height - (self._start_height or 0.0)
-        level = level_covariance(self._motion.covariance, heading, turn, velocity, self._settings.speed_scale)
+        covariance = level_covariance(self._motion.covariance, heading, turn, velocity, self._settings.speed_scale)
+        covariance[2, 2], covariance[5, 5] = self._heave.height_variance, self._heave.rate_variance
         return PoseEstimate(
             position=(heading.position.real, heading.position.imag, rise),
             velocity=(velocity.real, velocity.imag, self._heave.rate),
             orientation=multiply(from_yaw(self._yaw.offset + heading.yaw), orientation),
-            covariance=with_height(level, self._heave.height_variance, self._heave.rate_variance),
+            covariance=covariance,
         )
 
 
@@ -336,31 +337,25 @@ class _Pointing:
 
 
 def level_covariance(motion: Floats, heading: Heading, turn: complex, velocity: complex, speed_scale: float) -> Floats:
-    """Of horizontal position and velocity (4, 4), given out after a `turn` (cos + j sin) by the heading.
+    """Of position and velocity (6, 6), nothing vertical, given out after a `turn` (cos + j sin) by the heading.
 
     The filter's `motion` (4, 4), what the headings add, and the radar's scale, of sd `speed_scale`: the heading's
     error turns the `velocity` (m/s, x + jy), the scale stretches the track.
     """
-    cos, sin = turn.real, turn.imag
-    turned = np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, cos, -sin], [0, 0, sin, cos]])
-    level: Floats = turned @ motion @ turned.T
+    turned = np.zeros((6, 4))
+    turned[0, 0] = turned[1, 1] = turned[3, 2] = turned[4, 3] = turn.real
+    turned[1, 0] = turned[4, 2] = turn.imag
+    turned[0, 1] = turned[3, 3] = -turn.imag
     x, y = heading.position.real, heading.position.imag
     scale, yaw = speed_scale**2, heading.yaw_variance
-    level[0, 0] += heading.xx + scale * x * x
-    level[1, 1] += heading.yy + scale * y * y
-    level[0, 1] = level[1, 0] = level[0, 1] + heading.xy + scale * x * y
-    level[2, 2] += yaw * velocity.imag**2
-    level[3, 3] += yaw * velocity.real**2
-    level[2, 3] = level[3, 2] = level[2, 3] - yaw * velocity.real * velocity.imag
-    return level
-
-
-def with_height(level: Floats, height_variance: float, rate_variance: float) -> Floats:
-    """(6, 6) of position and velocity from `level` (4, 4) and the variances of height and vertical speed."""
     covariance = np.zeros((6, 6))
-    covariance[:2, :2], covariance[:2, 3:5] = level[:2, :2], level[:2, 2:]
-    covariance[3:5, :2], covariance[3:5, 3:5] = level[2:, :2], level[2:, 2:]
-    covariance[2, 2], covariance[5, 5] = height_variance, rate_variance
+    covariance[0, 0] = heading.xx + scale * x * x
+    covariance[1, 1] = heading.yy + scale * y * y
+    covariance[0, 1] = covariance[1, 0] = heading.xy + scale * x * y
+    covariance[3, 3] = yaw * velocity.imag**2
+    covariance[4, 4] = yaw * velocity.real**2
+    covariance[3, 4] = covariance[4, 3] = -yaw * velocity.real * velocity.imag
+    covariance += turned @ motion @ turned.T
     return covariance
 
 

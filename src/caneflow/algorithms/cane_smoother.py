@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings, level_covariance, with_height
+from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings, level_covariance
 from caneflow.algorithms.dead_reckoning import PoseEstimate
 from caneflow.algorithms.heading_hypotheses import Heading
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized
@@ -127,10 +127,11 @@ def _smoothed_estimate(
     velocity = turn * complex(state[2], state[3])
     filtered = before.covariance
     assert filtered is not None, "the filter gives one"
-    level = level_covariance(covariance[:4, :4], heading, turn, velocity, speed_scale)
+    smoothed = level_covariance(covariance[:4, :4], heading, turn, velocity, speed_scale)
+    smoothed[2, 2], smoothed[5, 5] = filtered[2, 2], filtered[5, 5]
     return PoseEstimate(
         position=(heading.position.real, heading.position.imag, before.position[2]),
         velocity=(velocity.real, velocity.imag, before.velocity[2]),
         orientation=multiply(from_yaw(sample.offset + heading.yaw), normalized(sample.orientation)),
-        covariance=with_height(level, float(filtered[2, 2]), float(filtered[5, 5])),
+        covariance=smoothed,
     )

@@ -23,8 +23,10 @@ def superior_edges(magnitudes: NDArray[np.floating]) -> tuple[list[float], list[
         and the two beside it; and K such differences. A flat row gives some index, and 0: whether there is anything
         to see is not decided here.
     """
-    falls = magnitudes[:, :-1] - magnitudes[:, 1:]
-    steepest = falls[:, 1:-1].argmax(axis=1)  # counted from column 1: with a neighbour on either side
+    # In one piece over all rows: where one ends and the next begins stands nonsense, and is not looked at.
+    falls, flat = np.empty(magnitudes.shape, magnitudes.dtype), magnitudes.reshape(-1)
+    np.subtract(flat[:-1], flat[1:], out=falls.reshape(-1)[:-1])
+    steepest = falls[:, 1:-2].argmax(axis=1)  # counted from column 1: with a neighbour on either side
     before, top, after = falls.take(steepest + _around(*falls.shape)).tolist()
     edges = []
     # Plain Python from here on: for a handful of numbers, numpy's calls cost more.

@@ -166,14 +166,14 @@ class GroundVelocityEstimator:
         if cells is None:
             return _nothing(delay)
         fit = self._fit(cells, rise, rise_error)
-        total = float(cells.power.sum())
-        coherence = float((np.abs(cells.pairs) * np.cos(fit.residual)).sum()) / total if total > 0 else 0.0
+        total = float(np.add.reduce(cells.power))
+        coherence = float(np.add.reduce(np.abs(cells.pairs) * np.cos(fit.residual))) / total if total > 0 else 0.0
         if coherence < settings.least_fit:
             turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
             if turn_rate is not None and turn_rate < settings.rest_turn_rate:
                 return _rest(delay, settings.rest_speed)
             return _nothing(delay)
-        if float(cells.per_forward.max()) * abs(fit.forward) > settings.alias_share * math.pi:
+        if float(np.maximum.reduce(cells.per_forward)) * abs(fit.forward) > settings.alias_share * math.pi:
             return _nothing(delay)
         self._learn_height(fit, 2 * delay / settings.window * len(returns.scans) * settings.every)
         return VelocityEstimate(
@@ -233,20 +233,24 @@ class GroundVelocityEstimator:
         turned[1:] = np.exp(cells.per_forward * (-1j * _SPEED_STEP))
         np.multiply.accumulate(turned, out=turned)
         forward = _LOWEST_SPEED + _SPEED_STEP * int(np.add.reduce(turned.real, axis=1).argmax())
-        phase = np.angle(pairs * np.exp(cells.per_forward * (-1j * forward))) + cells.per_forward * forward
+        off = pairs * np.exp(cells.per_forward * (-1j * forward))
+        expected = cells.per_forward * forward
+        phase = np.arctan2(off.imag, off.real) + expected
         vertical = height = 0.0
-        residual = phase - cells.per_forward * forward
-        columns = np.stack([cells.per_forward, cells.per_vertical, cells.per_height])
+        residual = phase - expected
+        columns = np.empty((4, len(pairs)))  # of the three unknowns, and what they explain
+        columns[0], columns[1], columns[3] = cells.per_forward, cells.per_vertical, phase
         for _ in range(3):
-            doubt = 1.0 + (residual * (1.0 / settings.outlier)) ** 2
+            doubt = residual * (1.0 / settings.outlier)
+            doubt *= doubt
+            doubt += 1.0
             columns[2] = cells.per_height * forward
-            weighted = columns * (weight / (doubt * doubt))
+            weighted = columns[:3] * (weight / (doubt * doubt))
             normal = np.einsum("ik,jk->ij", weighted, columns).tolist()
-            right = np.einsum("ik,k->i", weighted, phase).tolist()
             normal[0][0] += 1.0 / UNOBSERVED
             normal[1][1] += 1.0 / rise_error**2
             normal[2][2] += 1.0 / self._height_variance
-            (forward, vertical, height), (variance, height_variance) = _solved(normal, right)
+            (forward, vertical, height), (variance, height_variance) = _solved(normal)
             residual = phase - cells.per_forward * forward - cells.per_vertical * vertical - columns[2] * height
         return Fit(forward, rise + vertical, height, variance, height_variance, residual)
 
@@ -264,10 +268,12 @@ class GroundVelocityEstimator:
         self._height_variance = before * (1.0 - gain)
 
 
-def _solved(normal: list[list[float]], right: list[float]) -> tuple[Triple, tuple[float, float]]:
-    """Solution of three equations, and the first and last diagonal element of the inverse. By cofactors."""
-    (a, b, c), (_, d, e), (_, _, f) = normal
-    p, q, r = right
+def _solved(normal: list[list[float]]) -> tuple[Triple, tuple[float, float]]:
+    """Solution of three equations, (3, 4) with their right sides, and the inverse's first and last diagonal element.
+
+    The matrix is symmetric; by cofactors.
+    """
+    (a, b, c, p), (_, d, e, q), (_, _, f, r) = normal
     aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
     bb, bc, cc = a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * aa + b * ab + c * ac

@@ -81,7 +81,8 @@ class HeadingHypotheses:
         self._knot_due = settings.knot_interval
         self._field_sum, self._field_noise = 0j, 0.0
         self._knots: list[Knot] = []
-        self._spread_share = np.full(len(settings.bias_spreads), 1.0 / len(settings.bias_spreads))
+        self._spreads: Floats = np.array(settings.bias_spreads)
+        self._spread_share = np.full(len(self._spreads), 1.0 / len(self._spreads))
         grid = np.sinh(np.linspace(-2.0, 2.0, settings.biases)) / math.sinh(2.0)
         self._summary = Heading(0j, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._start(settings.largest_bias * grid)
@@ -104,10 +105,9 @@ class HeadingHypotheses:
 
     def level_biases(self, across: float, across_sd: float, along: float, along_sd: float) -> None:
         """What gravity shows of the bias about two level axes (rad/s): it tells how good a gyro this is."""
-        spreads = np.array(self._settings.bias_spreads)
-        log = np.zeros(len(spreads))
+        log = np.zeros(len(self._spreads))
         for value, sd in ((across, across_sd), (along, along_sd)):
-            variance = spreads**2 + sd**2
+            variance = self._spreads**2 + sd**2
             log -= 0.5 * value**2 / variance + 0.5 * np.log(variance)
         share = np.exp(log - log.max())
         self._spread_share = share / share.sum()
@@ -130,7 +130,7 @@ class HeadingHypotheses:
     def heading(self) -> Heading:
         """The mean over all hypotheses as of the last `advance`, but for the position, which is of now."""
         moved = cmath.rect(1.0, self._summary.yaw) * self._pending
-        return self._summary._replace(position=self._summary.position + moved)
+        return Heading(self._summary.position + moved, *self._summary[1:])
 
     @property
     def clock(self) -> tuple[float, float]:
@@ -147,17 +147,19 @@ class HeadingHypotheses:
         self._summary = self._mean(self._yaws(self._elapsed, self._turned), self._tracks)
 
     def _mean(self, yaws: Floats, tracks: Complexes) -> Heading:
-        yaw = float((self._weights * yaws).sum())
-        centre = complex((self._weights * tracks).sum())
+        weights, total = self._weights, np.add.reduce
+        yaw = float(total(weights * yaws))
+        centre = complex(total(weights * tracks))
         off = tracks - centre
         x, y = off.real, off.imag
+        weighted_x = weights * x
         return Heading(
             position=centre,
             yaw=yaw,
-            yaw_variance=float((self._weights * (yaws - yaw) ** 2).sum()),
-            xx=float((self._weights * x * x).sum()),
-            xy=float((self._weights * x * y).sum()),
-            yy=float((self._weights * y * y).sum()),
+            yaw_variance=float(total(weights * (yaws - yaw) ** 2)),
+            xx=float(total(weighted_x * x)),
+            xy=float(total(weighted_x * y)),
+            yy=float(total(weights * y * y)),
         )
 
     def _yaws(self, elapsed: float, turned: float) -> Floats:
@@ -241,7 +243,7 @@ class HeadingHypotheses:
         self._log_likelihood -= 0.5 * white * white + np.log(deviation)
 
     def _weigh(self) -> None:
-        spreads = np.array(self._settings.bias_spreads)
+        spreads = self._spreads
         parts = np.exp(-0.5 * (self._biases[:, None] / spreads) ** 2) * (self._spread_share / spreads)
         log = np.log(parts.sum(axis=1) + 1e-300) + self._log_mass + self._log_likelihood
         weights = np.exp(log - log.max())

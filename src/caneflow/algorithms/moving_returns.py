@@ -66,14 +66,15 @@ class MovingReturnsFilter:
         count, bins = scans.shape
         if count == 0 or bins == 0:
             raise ValueError(f"a frame of {count} scans of {bins} bins holds nothing")
-        if scans.dtype.kind in "fc" and not np.abs(scans).max() <= LARGEST_SAMPLE:
+        kind = scans.dtype.kind
+        if kind in "fc" and not np.abs(scans).max() <= LARGEST_SAMPLE:
             # One NaN would stay in the running mean for ever; a huge value would become one.
             raise ValueError(f"frame at {stamp_ns} ns has samples that are not finite or above {LARGEST_SAMPLE:g}")
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"frame at {stamp_ns} ns is not newer than the last, {self._last_ns} ns")
-        make = (parameters, bins, scans.dtype.kind == "c")
+        make = (parameters, bins, kind == "c")
         if make != self._make:
-            self._start_anew(make, parameters, bins, is_complex=scans.dtype.kind == "c")
+            self._start_anew(make, parameters, bins, is_complex=kind == "c")
         period_ns = parameters.scan_period * 1e9
         first_ns = stamp_ns - round((count - 1) * period_ns)
         elapsed_ns, lost, restarted = self._since_last(first_ns, period_ns)

@@ -77,15 +77,20 @@ class PaperSpeed:
             shallowest=settings.shallowest,
             steepest=settings.steepest,
         )
-        self._weights = hann(settings.window).astype(np.complex64)  # of the type they scale: no casts
         self._cell = settings.transform / settings.window  # Doppler bins per resolution cell
         self._beyond = settings.edge_beyond_speed * self._cell if settings.compensate_edge else 0.0  # Doppler bins
+        count = settings.rays + 2  # rows: one more than rays at either end
+        # of each scan's samples, real and imaginary parts in turn: multiplied by what has their shape, without casts
+        self._weights = np.repeat(hann(settings.window)[:, None], 2 * count, axis=1)
         # Slow-time rows to transform; what lies behind the window stays 0. numpy takes four rows at a time: any that
         # are left over cost as much as all four.
-        rows = math.ceil((settings.rays + 2) / 4) * 4
-        self._padded = np.zeros((rows, settings.transform), np.complex64)
-        self._scans = self._padded[: settings.rays + 2, : settings.window]
-        self._spectra = np.empty_like(self._padded)
+        self._padded = np.zeros((math.ceil(count / 4) * 4, settings.transform), np.complex64)
+        self._rows = self._padded[:count, : settings.window].T
+        # Room for what is worked out anew for every scan: to allot it costs as much as to fill it.
+        self._transformed = np.empty_like(self._padded)
+        self._spectra = self._transformed[:count]
+        self._row_power = np.empty(self._spectra.shape, np.float32)
+        self._ray_power = np.empty((settings.rays, settings.transform), np.float32)
         self._window = SlowTimeWindow(length=settings.window, bins=0)
         self._caster: RayCaster | None = None
         self._stamps_ns: deque[int] = deque(maxlen=settings.window)
@@ -131,7 +136,8 @@ class PaperSpeed:
         for scan in returns.scans:
             self._window.push(scan)
         self._stamps_ns.extend(returns.stamps_ns)
-        self._stand_ins.extend(returns.stamps_ns[: returns.lost])
+        if returns.lost:
+            self._stand_ins.extend(returns.stamps_ns[: returns.lost])
         while self._stand_ins and self._stand_ins[0] < self._stamps_ns[0]:
             self._stand_ins.popleft()
 
@@ -149,17 +155,21 @@ class PaperSpeed:
         return self._caster.cast(height=height, axis=pitch(self._geometry, orientation))
 
     def _power(self, rays: Rays) -> NDArray[np.float32]:
-        """Doppler power along each ray, in sum with its neighbours'; shape (K, transform), FFT order.
+        """Doppler power along each ray, in sum with its neighbours'; shape (K, transform), FFT order, for one scan.
 
         One range bin's spectrum is speckle, its steepest fall often that of a chance gap below the fastest ground.
         In sum over three bins, most of a range cell apart, the edge lies where the expected spectrum has it.
         """
-        np.multiply(self._window.rows(rays.rows), self._weights, out=self._scans)
+        scans = self._window.of(rays.rows)
+        parts = scans.view(np.float32)
+        parts *= self._weights
+        self._rows[:] = scans
         # Power is compared with power only. Without a factor (norm="backward") numpy would go over to double.
-        np.fft.fft(self._padded, norm="forward", out=self._spectra)  # type: ignore[arg-type]  # stubs know double only
-        power: NDArray[np.float32] = np.abs(self._spectra[: len(rays.rows)])
+        np.fft.fft(self._padded, norm="forward", out=self._transformed)  # type: ignore[arg-type]  # stubs know double only
+        power, summed = self._row_power, self._ray_power
+        np.abs(self._spectra, out=power)
         power *= power
-        summed = power[:-2] + power[1:-1]
+        np.add(power[:-2], power[1:-1], out=summed)
         summed += power[2:]
         return summed
 
@@ -214,7 +224,7 @@ class PaperSpeed:
             spread = math.sqrt(sum(map(mul, falls, [(speed - centre) ** 2 for speed in speeds])) / total)
         else:
             centre = middle if settings.average == "median" else sum(speeds) / count
-            spread = math.sqrt(sum([(speed - centre) ** 2 for speed in speeds]) / count)
+            spread = math.sqrt(sum([(off := speed - centre) * off for speed in speeds]) / count)
         return SpeedEstimate(speed=centre, quality=spread, rays=count, valid=True, delay=delay)
 
 

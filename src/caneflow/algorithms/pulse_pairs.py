@@ -10,9 +10,9 @@ Meteorology, 1978).
 """
 
 import math
+from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,7 @@ Floats = NDArray[np.float64]
 _LINE_GRID: Final = 512  # phases that line_phase looks at
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PulsePairs:
+class PulsePairs(NamedTuple):
     """Sums over the window and over one range cell each, for K cells."""
 
     pairs: NDArray[np.complex128]  # shape (K,), of x(t) conj(x(t - lag T))
@@ -57,6 +56,7 @@ class PulsePairWindow:
         self._stamps_ns: deque[int] = deque(maxlen=window + lag)
         self._bins = 1  # of a cell
         self._ranges: Floats = np.zeros(0)
+        self._range_list: list[float] = []  # the same
         self._scans = SlowTimeWindow(length=window + lag, bins=0)
 
     def push(self, returns: MovingReturns) -> None:
@@ -75,7 +75,8 @@ class PulsePairWindow:
 
     def sums(self, nearest: float = 0.0, farthest: float = np.inf) -> PulsePairs:
         """The sums over the whole window, for cells between two ranges (m)."""
-        first, last = np.searchsorted(self._ranges, (nearest, farthest)).tolist()
+        # numpy's search costs ten times as much for two numbers
+        first, last = bisect_left(self._range_list, nearest), bisect_left(self._range_list, farthest)
         scans = self._scans.view()[first * self._bins : last * self._bins].T  # (window + lag, bins)
         newer, older = scans[self._lag :], scans[: -self._lag]
         power = scans.real**2 + scans.imag**2
@@ -96,6 +97,7 @@ class PulsePairWindow:
         self._bins = max(1, min(bins, round(self._cell / parameters.range_step)))
         middles = self._bins * np.arange(bins // self._bins, dtype=np.float64) + 0.5 * (self._bins - 1)
         self._ranges = np.asarray(parameters.range_start + parameters.range_step * middles, dtype=np.float64)
+        self._range_list = self._ranges.tolist()
         assert self._stamps_ns.maxlen is not None, "made so"
         self._scans = SlowTimeWindow(length=self._stamps_ns.maxlen, bins=bins)
         self._stamps_ns.clear()

@@ -11,6 +11,7 @@ Doppler axis: at 5 dB, walking then differs from rest by a factor of 1.0 to 2.0,
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated
 
 import numpy as np
@@ -42,10 +43,17 @@ def peaks_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, fl
     The floor is the spectrum's lower quartile, a little below the mean noise power: moving ground fills Doppler on
     one side of zero only, so that at least a quarter of the axis holds noise alone.
     """
+    approaching, receding, _ = np.maximum.reduceat(power, _sides(len(power), cell)).tolist()
+    ordered = power.copy()
+    ordered.sort()
+    return approaching, receding, float(ordered[len(power) // 4])
+
+
+@cache
+def _sides(length: int, cell: float) -> NDArray[np.intp]:
+    """Where in a spectrum what approaches begins, what recedes, and what stands again."""
     standing = math.ceil(STANDING_CELLS * cell)
-    half = len(power) // 2
-    approaching, receding = np.maximum.reduce(power[standing:half]), np.maximum.reduce(power[half : 1 - standing])
-    return float(approaching), float(receding), float(np.sort(power)[len(power) // 4])
+    return np.array([standing, length // 2, length + 1 - standing])
 
 
 def is_at_rest(peak: float, floor: float, turn_rate: float, settings: RestSettings) -> bool:

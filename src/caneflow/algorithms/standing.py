@@ -29,7 +29,7 @@ class StandingDetector:
     def __init__(self, settings: StandingSettings) -> None:
         self._settings = settings
         self._samples: deque[tuple[int, float, float, float, float]] = deque()
-        self._sums = [0.0] * 7
+        self._sums = (0.0,) * 7  # of turn rate, accelerations, and their squares
 
     def update(self, stamp_ns: int, gyro: Vector, acceleration: Vector) -> bool:
         """Take a sample: turn rate (rad/s) and acceleration in R0 without gravity (m/s^2)."""
@@ -47,19 +47,16 @@ class StandingDetector:
         count = len(self._samples)
         if count < 4:  # a gap
             return False
-        turning, *sums = (value / count for value in self._sums)
+        if self._sums[0] / count > self._settings.largest_turn_rate:
+            return False
         limit = self._settings.largest_acceleration**2
-        return turning <= self._settings.largest_turn_rate and all(
-            sums[axis + 3] - sums[axis] ** 2 <= limit for axis in range(3)
-        )
+        means = [value / count for value in self._sums]
+        return all(means[axis + 3] - means[axis] ** 2 <= limit for axis in (1, 2, 3))
 
     def _add(self, sample: tuple[int, float, float, float, float], sign: float) -> None:
-        sums = self._sums
         _, turning, x, y, z = sample
-        sums[0] += sign * turning
-        sums[1] += sign * x
-        sums[2] += sign * y
-        sums[3] += sign * z
-        sums[4] += sign * x * x
-        sums[5] += sign * y * y
-        sums[6] += sign * z * z
+        turned, sx, sy, sz, sxx, syy, szz = self._sums
+        dx, dy, dz = sign * x, sign * y, sign * z
+        self._sums = (
+            turned + sign * turning, sx + dx, sy + dy, sz + dz, sxx + dx * x, syy + dy * y, szz + dz * z,
+        )  # fmt: skip

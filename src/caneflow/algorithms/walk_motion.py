@@ -43,7 +43,9 @@ class WalkMotion:
         sd = (1e-6, 1e-6, settings.velocity, settings.velocity, settings.bias, settings.bias, settings.pointing)
         self._p: Floats = np.diag(np.square(sd))
         self._f: Floats = _IDENTITY.copy()
-        self._noise: Floats = np.zeros(7)
+        accelerations, biases = settings.acceleration_noise**2, settings.bias_walk**2
+        walks = (0.0, 0.0, accelerations, accelerations, biases, biases, settings.pointing_walk**2)
+        self._noise_rates: Floats = np.array(walks)  # variances per s
 
     @property
     def position(self) -> tuple[float, float]:
@@ -70,7 +72,7 @@ class WalkMotion:
 
         Returns the velocity gained, m/s, as x + jy.
         """
-        s, x = self._settings, self._x
+        x = self._x
         gained_x = t * (acceleration[0] - cos_yaw * x[_BF] + sin_yaw * x[_BL])
         gained_y = t * (acceleration[1] - sin_yaw * x[_BF] - cos_yaw * x[_BL])
         x[_PX] += t * (x[_VX] + 0.5 * gained_x)
@@ -83,10 +85,8 @@ class WalkMotion:
         f[_VX, _BL], f[_VY, _BF] = t * sin_yaw, -t * sin_yaw
         # 7 x 7 is below the size at which any BLAS takes more than one thread
         self._p = f @ self._p @ f.T
-        self._noise[_VX] = self._noise[_VY] = s.acceleration_noise**2 * t
-        self._noise[_BF] = self._noise[_BL] = s.bias_walk**2 * t
-        self._noise[_BETA] = s.pointing_walk**2 * t
-        self._p.flat[::8] += self._noise
+        diagonal = self._p.reshape(-1)[::8]
+        diagonal += self._noise_rates * t
         return complex(gained_x, gained_y)
 
     def coast(self, t: float) -> None:
