@@ -114,20 +114,21 @@ class CaneSmoother:
         places = states[:, 0] + 1j * states[:, 1]
         hindsight = self._filter.heading.hindsight(times[:, 0], times[:, 1], np.diff(places, prepend=places[:1]))
         return [
-            _smoothed_estimate(sample, state, covariance, heading, self._settings.speed_scale)
+            _smoothed_estimate(sample, state, covariance, heading, self._settings)
             for sample, state, covariance, heading in zip(self._samples, states, covariances, hindsight, strict=True)
         ]
 
 
 def _smoothed_estimate(
-    sample: _Sample, state: Floats, covariance: Floats, heading: Heading, speed_scale: float
+    sample: _Sample, state: Floats, covariance: Floats, heading: Heading, settings: CaneFilterSettings
 ) -> PoseEstimate:
     before = sample.estimate
     turn = cmath.rect(1.0, heading.yaw)
     velocity = turn * complex(state[2], state[3])
     filtered = before.covariance
     assert filtered is not None, "the filter gives one"
-    smoothed = level_covariance(covariance[:4, :4], heading, turn, velocity, speed_scale)
+    smoothed = level_covariance(covariance[:4, :4], heading, turn, velocity, settings.speed_scale)
+    smoothed *= settings.covariance_share
     smoothed[2, 2], smoothed[5, 5] = filtered[2, 2], filtered[5, 5]
     return PoseEstimate(
         position=(heading.position.real, heading.position.imag, before.position[2]),
