@@ -6,6 +6,7 @@ The launcher starts `python -m <program> <plan>`; the plan says what to read, wh
 import logging
 import signal
 import sys
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
@@ -25,6 +26,7 @@ from caneflow.runtime.hosts.bus import (
     Answered,
     Arrived,
     Asked,
+    Broken,
     Bus,
     Confirmed,
     Event,
@@ -57,6 +59,10 @@ ASK_PERIOD = 0.3  # s between two requests for samples that have not come
 LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run
 REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
 SNAPSHOT_PERIOD = 0.5  # s between two snapshots of an operator
+QUICK = 0.002  # s: a node that takes longer for an event is not quick ...
+MOST_SLOW = (
+    0.25  # ... and when so great a share of the last 64 or so was slow, Zenoh's threads do not wait for it any more
+)
 
 
 def run(program: Program) -> None:
@@ -151,6 +157,10 @@ class _ReaderNode(ABC):
         # Each writer is asked at the start what it has sent so far, until it answers: a node that is started anew may
         # have missed its last word, and the link to the writer may not be there yet.
         self._unanswered = dict.fromkeys(plan.inputs, 0.0)  # s, monotonic: when to ask next
+        self.lock = threading.RLock()  # over all of this node's state
+        self._quick = not plan.replay  # a replay may block while it sends, which Zenoh's threads must not
+        self._slow = 0.0  # share of events
+        self._came = False  # anything, at once, since this was last looked at
         for port, arrivals in reader.inputs.items():
             arrivals.patient = True
             arrivals.clock_offset = None if plan.inputs[port].clock else 0
@@ -160,8 +170,46 @@ class _ReaderNode(ABC):
         came = False
         for event in self.bus.events(timeout):
             came = True
-            self.take(event)
+            with self.lock:
+                self.take(event)
+        came, self._came = came or self._came, False
         return came
+
+    def take_at_once(self, event: Event) -> bool:
+        """Live, on one of Zenoh's threads: take an event and do what follows; False: not here.
+
+        While the node is quick, that spares waking its own thread for every sample. One that is not would hold up
+        everything else on its links, and its queues would not see what waits.
+        """
+        if not self._quick:
+            return False
+        with self.lock:
+            if not self._quick:  # it has ended meanwhile, or become slow
+                return False
+            began = time.monotonic()
+            try:
+                if type(event) is Arrived:  # as nearly all are
+                    self.take_sample(event)
+                else:
+                    self.take(event)
+                self.follow_up(event)
+            except BaseException as error:
+                self._quick = False
+                self.bus.put(Broken(error))
+            self._came = True
+            self._slow += ((time.monotonic() - began > QUICK) - self._slow) / 64
+            if self._slow > MOST_SLOW:
+                self._quick = False
+        return True
+
+    @abstractmethod
+    def follow_up(self, event: Event) -> None:
+        """Do what an event makes possible that was taken at once."""
+
+    def take_no_more(self) -> None:
+        """From here on what comes waits in the inbox."""
+        with self.lock:
+            self._quick = False
 
     def take(self, event: Event) -> None:
         match event:
@@ -180,6 +228,8 @@ class _ReaderNode(ABC):
                 self.set_clock(event.clock)
             case Stopped():
                 self.stopped = True
+            case Broken(error):
+                raise error
             case _:
                 pass  # for sources
 
@@ -258,16 +308,28 @@ class _OperatorNode(_ReaderNode):
 
     def run(self) -> None:
         resumed = self.resume()
+        self.bus.at_once = self.take_at_once
         self.bus.declare_ready()
         if resumed:
-            self.send_again()
+            with self.lock:
+                self.send_again()
         while not self.stopped:
             self.take_events(timeout=REPORT_PERIOD)
-            self.handle_what_is_due()
-            self.ask_for_missing()
-            self.wait_no_longer_than_allowed()
-            self.report()
+            with self.lock:
+                self.handle_what_is_due()
+                self.ask_for_missing()
+                self.wait_no_longer_than_allowed()
+                self.report()
+        self.take_no_more()
         self.count(self.sent(), at_once=True)
+
+    def follow_up(self, event: Event) -> None:
+        if isinstance(event, Confirmed):
+            return
+        while (emitted := self.stage.step(time.time_ns())) is not None:
+            self.send(emitted)
+        if self.stage.tells_more_than_samples():
+            self.reports.progress(self.progress())
 
     def take(self, event: Event) -> None:
         match event:
@@ -292,15 +354,18 @@ class _OperatorNode(_ReaderNode):
     def handle_what_is_due(self) -> None:
         now = None if self.plan.replay else time.time_ns()
         while (emitted := self.stage.step(now)) is not None:
-            for port, message, seq in emitted:
-                payload = numbered(message, seq)
-                self.history.keep(port, seq, payload)
-                self.bus.send(port, payload)
+            self.send(emitted)
             if self.reports.due():
                 self.reports.progress(self.progress())
                 self.keep_snapshot()
             if self.bus.pending():
                 self.take_events(timeout=0)
+
+    def send(self, emitted: list[tuple[str, Sample, int]]) -> None:
+        for port, message, seq in emitted:
+            payload = numbered(message, seq)
+            self.history.keep(port, seq, payload)
+            self.bus.send(port, payload)
 
     def progress(self) -> Progress:
         """How far the node has come, and what its readers' writers may forget."""
@@ -368,20 +433,31 @@ class _SinkNode(_ReaderNode):
 
     def run(self) -> None:
         try:
+            self.bus.at_once = self.take_at_once
             self.bus.declare_ready()
             while not self.stopped:
-                if not self.take_events(timeout=REPORT_PERIOD):
-                    self.tap.idle(time.time_ns())
-                self.ask_for_missing()
-                if self.tap.ended and not self.tap.finished:
-                    self.tap.finish()
-                    self.count({}, at_once=True)
-                if self.reports.due() or self.tap.finished:
-                    self.reports.progress(self.tap.progress())
-                self.count({})
+                came = self.take_events(timeout=REPORT_PERIOD)
+                with self.lock:
+                    self.go_on(came)
         finally:
+            self.take_no_more()
             self.tap.finish()
         self.count({}, at_once=True)
+
+    def go_on(self, came: bool) -> None:
+        """What is to be done now and then, whether samples came or not."""
+        if not came:
+            self.tap.idle(time.time_ns())
+        self.ask_for_missing()
+        if self.tap.ended and not self.tap.finished:
+            self.tap.finish()
+            self.count({}, at_once=True)
+        if self.reports.due() or self.tap.finished:
+            self.reports.progress(self.tap.progress())
+        self.count({})
+
+    def follow_up(self, event: Event) -> None:
+        """Nothing: a sink has done with a sample when it has taken it."""
 
     def take(self, event: Event) -> None:
         if isinstance(event, Questioned):

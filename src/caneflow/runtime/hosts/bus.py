@@ -1,6 +1,7 @@
 """One node's place on the bus: its Zenoh session, its keys, and one inbox for everything that comes.
 
-Zenoh's threads only put things into the inbox; what they mean is decided on the node's own thread.
+Zenoh's threads put things into the inbox; what they mean is decided on the node's own thread. Live, a node may take
+samples at once, on the thread that brought them: waking another one costs more than most operators do.
 """
 
 import logging
@@ -27,6 +28,8 @@ C = TypeVar("C", bound=msgspec.Struct)
 AGAIN = "caneflow.Again/1"
 ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
+TIMED_PERIOD = 0.013  # s between two in a live run; odd as well
+ENCODINGS_KEPT = 8
 POLL = 0.01  # s between two looks at a condition that Zenoh does not signal
 
 
@@ -91,6 +94,12 @@ class Timed(msgspec.Struct, frozen=True, gc=False):
     clock: Clock
 
 
+class Broken(msgspec.Struct, frozen=True, gc=False):
+    """Something was raised while an event was taken at once: it belongs to the node's own thread."""
+
+    error: BaseException
+
+
 class Started(msgspec.Struct, frozen=True, gc=False):
     """The launcher's word that every node is ready."""
 
@@ -107,7 +116,7 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
 
 Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
 Event: TypeAlias = (
-    Arrived | Answered | Asked | Questioned | Confirmed | Noted | Marked | Timed | Started | Opened | Stopped
+    Arrived | Answered | Asked | Questioned | Confirmed | Noted | Marked | Timed | Broken | Started | Opened | Stopped
 )
 
 
@@ -117,6 +126,8 @@ class Bus:
     def __init__(self, plan: NodePlan) -> None:
         self._plan = plan
         self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        # Takes an event on the thread that brought it; False: it did not, and the event goes into the inbox.
+        self.at_once: Callable[[Event], bool] | None = None
         self._session = open_session(listen=plan.links.listen, connect=plan.links.connect, replay=plan.replay)
         # Whatever must outlive its statement: a liveliness token that no variable holds is undeclared at once.
         self._held: list[Held] = []
@@ -125,7 +136,8 @@ class Bus:
         self._progress = self._control_publisher("progress", plan.node)
         self._counters = self._control_publisher("counters", plan.node)
         self._late = self._control_publisher("late")
-        self._until_timed = 0  # samples to send before the next that says when it was sent
+        self._timed_next = 0.0  # s, monotonic; live
+        self._until_timed = 0  # in a replay: samples to send before the next that says when it was sent
 
     def __enter__(self) -> "Bus":
         return self
@@ -148,6 +160,10 @@ class Bus:
     def put(self, event: Event) -> None:
         """Add an event of this process's own; safe in a signal handler."""
         self._inbox.put(event)
+
+    def _bring(self, event: Event) -> None:
+        if self.at_once is None or not self.at_once(event):
+            self._inbox.put(event)
 
     def events(self, timeout: float | None) -> Iterator[Event]:
         """Everything in the inbox, after waiting up to `timeout` s (None: for ever) for the first."""
@@ -191,12 +207,21 @@ class Bus:
 
     def send(self, port: str, payload: bytes) -> None:
         """Publish a sample's bytes on an output port."""
-        if self._until_timed:
-            self._until_timed -= 1
-            self._publishers[port].put(payload)
-        else:  # beside the sample, whose bytes are the recording's
-            self._until_timed = TIMED_IN_REPLAY - 1 if self._plan.replay else 0
+        if self._is_timed():  # beside the sample, whose bytes are the recording's
             self._publishers[port].put(payload, attachment=sending_now())
+        else:
+            self._publishers[port].put(payload)
+
+    def _is_timed(self) -> bool:
+        """Whether the next sample is to say when it was sent: some do, which is enough to know how long they take."""
+        if self._plan.replay:
+            self._until_timed = self._until_timed - 1 if self._until_timed else TIMED_IN_REPLAY - 1
+            return self._until_timed == TIMED_IN_REPLAY - 1
+        now = time.monotonic()
+        if now < self._timed_next:
+            return False
+        self._timed_next = now + TIMED_PERIOD
+        return True
 
     def send_progress(self, progress: Progress) -> None:
         """Publish how far this node has come."""
@@ -214,7 +239,7 @@ class Bus:
         plan = self._plan
         by_writer: dict[str, dict[str, str]] = {}  # writer -> its port -> this node's port
         for port, wire in plan.inputs.items():
-            self._subscribe(wire.key, self._on_sample(port))
+            self._subscribe(wire.key, self._on_sample(port), indirect=not plan.replay)
             by_writer.setdefault(wire.writer, {})[wire.key.rpartition("/")[2]] = port
         for writer, ports in by_writer.items():
             self._subscribe(control_key(plan.flow, "progress", writer), self._on_progress(ports))
@@ -235,9 +260,9 @@ class Bus:
         if plan.inputs and not plan.outputs:
             self._answer_with(control_key(plan.flow, "ask", plan.node), self._on_question)
 
-    def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
-        # indirect=False: straight on Zenoh's receiving thread, which a put into the inbox does not hold up.
-        handler = zenoh.handlers.Callback(callback, indirect=False)
+    def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None], *, indirect: bool = False) -> None:
+        # Straight on Zenoh's receiving thread, which a put into the inbox does not hold up; or on a thread of its own.
+        handler = zenoh.handlers.Callback(callback, indirect=indirect)
         self._held.append(self._session.declare_subscriber(key, handler))
 
     def _answer_with(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
@@ -267,9 +292,16 @@ class Bus:
         )
 
     def _on_sample(self, port: str) -> Callable[[zenoh.Sample], None]:
+        schemas: dict[str, str] = {}  # by encoding: there is one, or a few that are wrong
+
         def put(sample: zenoh.Sample) -> None:
-            schema = str(sample.encoding).rpartition(";")[2]
-            self._inbox.put(Arrived(port, sample.payload.to_bytes(), schema, sent_at=sent_at(sample)))
+            encoding = str(sample.encoding)
+            schema = schemas.get(encoding)
+            if schema is None:
+                schema = encoding.rpartition(";")[2]
+                if len(schemas) < ENCODINGS_KEPT:
+                    schemas[encoding] = schema
+            self._bring(Arrived(port, sample.payload.to_bytes(), schema, sent_at=sent_at(sample)))
 
         return put
 
@@ -297,7 +329,7 @@ class Bus:
         def put(sample: zenoh.Sample) -> None:
             progress = _control(sample, Progress)
             if progress and key in progress.confirmed:
-                self._inbox.put(Confirmed(port, reader, progress.confirmed[key]))
+                self._bring(Confirmed(port, reader, progress.confirmed[key]))
 
         return put
 
@@ -306,7 +338,7 @@ class Bus:
             progress = _control(sample, Progress)
             for port, mark in progress.ports.items() if progress else ():
                 if port in ports:
-                    self._inbox.put(Marked(ports[port], mark))
+                    self._bring(Marked(ports[port], mark))
 
         return put
 

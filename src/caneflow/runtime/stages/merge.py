@@ -60,9 +60,17 @@ class Merge:
 
     def handled(self) -> int:
         """Up to which stamp (ns) everything has come and has been handed on."""
-        return min(
-            (queue[0].stamp - 1 if queue else mark) for queue, mark in zip(self._queues, self._watermarks, strict=True)
-        )
+        lowest = END
+        for queue, mark in zip(self._queues, self._watermarks):  # noqa: B905 - of equal length; looked at for each sample
+            passed = queue[0].stamp - 1 if queue else mark
+            if passed < lowest:
+                lowest = passed
+        return lowest
+
+    @property
+    def ended(self) -> bool:
+        """Whether everything has come and has been handed on."""
+        return self._watermarks[-1] == END and self.handled() == END
 
     def _next(self) -> tuple[int | None, int | None]:
         """The port whose oldest sample is next by (stamp, port order), and one that may still bring one before it."""

@@ -35,6 +35,7 @@ class Stage:
         self.inputs = {port: Arrivals(node, port, plan) for port, plan in inputs.items()}
         self.outputs = {port: Departures(plan) for port, plan in outputs.items()}
         self.finished = False
+        self._awaited = [out for out in self.outputs.values() if out.plan.awaited]
         self._operator = operator
         self._merge = Merge(tuple(inputs))
 
@@ -90,7 +91,7 @@ class Stage:
                 arrivals.leave_out(message, "dropped")
                 return []
             return self._handled(port, message)
-        if not self.finished and self._merge.handled() == END:
+        if not self.finished and self._merge.ended:
             self.finished = True
             return [self._numbered(port, message) for port, message in self._operator.finish()]
         return None
@@ -122,8 +123,10 @@ class Stage:
 
     def tells_more_than_samples(self) -> bool:
         """Whether a reader waits, and cannot see from the samples alone, how far this node has come."""
+        if not self._awaited:
+            return False
         handled = self._merge.handled()
-        return any(out.plan.awaited and out.last_stamp < handled for out in self.outputs.values())
+        return any(out.last_stamp < handled for out in self._awaited)
 
     def left_out(self) -> list[LeftOut]:
         """What was not handled since this was last asked."""
