@@ -232,17 +232,17 @@ def _machine(status: FlowStatus, offset: tuple[float, float]) -> Iterator[Findin
 
 def _nodes(session: zenoh.Session, status: FlowStatus) -> Iterator[Finding]:
     attempts: tuple[str, ...]
-    readers = {
-        edge.reader.partition(".")[0] for edge in status.edges
-    }  # they count whether anything comes or not; a source may wait
+    # A reader counts whether anything comes or not; a source may wait.
+    readers = {edge.reader.partition(".")[0] for edge in status.edges}
     for node in status.nodes:
+        silent = node.uptime if node.counted is None else node.counted
         said = f"; it said: {node.said}" if node.said else ""
         if node.state != "ready":
             text = f"is {node.state}{said}"
             attempts = ("its log lines say why; run its program's test alone", "more time: ready_timeout_s in the file")
             yield Finding(node=node.node, state="bad", text=text, attempts=attempts)
-        elif node.counted is not None and node.counted > STALE and (node.node in readers or any(node.rates.values())):
-            text = f"has said nothing for {node.counted:.0f} s, pid {node.pid} is there{said}"
+        elif silent > STALE and (node.node in readers or any(node.rates.values())):
+            text = f"has said nothing for {silent:.0f} s, pid {node.pid} is there{said}"
             attempts = (f"is it stopped, or in a long computation? py-spy dump --pid {node.pid}",)
             yield Finding(node=node.node, state="bad", text=text, attempts=attempts)
         elif node.restarts:
