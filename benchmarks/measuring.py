@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import psutil
@@ -32,7 +32,7 @@ class Measured:
     rate: float  # samples per s that arrived
     lost: float  # share
     start_up: float  # s from the command to the first sample
-    said: str = ""  # what the processes printed
+    said: str = field(default="", repr=False)  # what the processes printed
 
 
 def measured(commands_for: Callable[[Job], list[list[str]]], job: Job) -> Measured:

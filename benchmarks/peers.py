@@ -44,6 +44,11 @@ ABOUT = {
     "start": "From the command to the first sample (s), and the share of samples lost while starting.",
 }
 SHOWN = {"hop": ("p50", "p99", "cpu"), "drain": ("rate",), "start": ("start_up", "lost")}
+# Ratios of caneflow to raw Zenoh in the same run that something has to have gone wrong for: a noisy machine moves both.
+BOUNDS = {
+    "hop": {"IMU, 100 Hz": {"cpu": 1.7}, "IMU, 1 kHz": {"p50": 2.0, "cpu": 1.7}, "frame of 480, 100 Hz": {"cpu": 1.7}},
+    "start": {"IMU, 100 Hz": {"start_up": 1.0}},
+}
 RATIOS = {"hop": ("p50", "cpu"), "drain": ("rate",), "start": ("start_up",)}
 
 
@@ -66,10 +71,13 @@ def main() -> None:
         able = [name for name in contenders if part != "drain" or name != "dora"]
         found[part] = rounds(PARTS[part], able, options.repeats)
     page = "\n".join(written(found, options.repeats))
+    slower = list(regressions(found))
     print(page)
     if options.write:
         options.write.write_text(page + "\n")
         options.write.with_suffix(".json").write_text(json.dumps(plain(found), indent=1) + "\n")
+    if slower:
+        sys.exit("\n".join(slower))
 
 
 def rounds(jobs: Mapping[str, Job], contenders: Sequence[str], repeats: int) -> Found:
@@ -97,6 +105,17 @@ def written(found: Mapping[str, Found], repeats: int) -> Iterator[str]:
             for name, runs in by_name.items():
                 ratios = [f"**{ratio(runs, by_name[BASE], key):.2f}**" for key in RATIOS[part]]
                 yield f"| {job} | {name} | " + " | ".join([*ratios, *(shown(runs, key) for key in keys)]) + " |"
+
+
+def regressions(found: Mapping[str, Found]) -> Iterator[str]:
+    """What costs more than it may, beside raw Zenoh in the same run."""
+    for part, jobs in BOUNDS.items():
+        for job, bounds in jobs.items():
+            by_name = found.get(part, {}).get(job, {})
+            for key, bound in bounds.items() if BASE in by_name else ():
+                value = ratio(by_name["caneflow"], by_name[BASE], key)
+                if value > bound:
+                    yield f"{part}, {job}: {key} is {value:.2f} times that of {BASE}; it was below {bound} before"
 
 
 def ratio(runs: Sequence[Measured], base: Sequence[Measured], key: str) -> float:

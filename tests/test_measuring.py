@@ -1,0 +1,45 @@
+"""The benchmarks' own parts: their graphs load, what has become slower is named, and nothing else."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from benchmarks import canes, peers, scaling
+from benchmarks.contenders import HERE
+from benchmarks.measuring import Measured
+from benchmarks.work import VARIABLE
+from caneflow.runtime.dataflow.loading import load
+
+
+def run(p50: float, cpu: float) -> Measured:
+    return Measured(p50=p50, p99=2 * p50, cpu=cpu, rate=1000.0, lost=0.0, start_up=1.0)
+
+
+def test_what_costs_more_than_it_may_is_named_with_its_ratio() -> None:
+    bound = peers.BOUNDS["hop"]["IMU, 1 kHz"]["cpu"]
+    base = [run(100.0, 200.0), run(100.0, 210.0), run(900.0, 190.0)]  # one run in three met a busy machine
+    fine = [run(110.0, 200.0 * bound - 1.0)] * 3
+    worse = [run(110.0, 200.0 * bound + 10.0)] * 3
+    for runs, said in ((fine, []), (worse, [f"hop, IMU, 1 kHz: cpu is {bound + 0.05:.2f} times that of raw Zenoh"])):
+        found = {"hop": {"IMU, 1 kHz": {"caneflow": runs, "raw Zenoh": base}}}
+        assert [line.partition(";")[0] for line in peers.regressions(found)] == said
+
+
+@pytest.mark.parametrize(("chain", "fan"), [(1, 1), (20, 1), (1, 20)])
+def test_the_graphs_that_grow(chain: int, fan: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    point = scaling.Point(x=1.0, job=scaling.imu(100.0), chain=chain, fan=fan)
+    monkeypatch.setenv(VARIABLE, point.job.environment()[VARIABLE])
+    monkeypatch.syspath_prepend(os.fspath(Path(__file__).parents[1]))
+    file = tmp_path / "scaling.yaml"
+    file.write_text(scaling.flow(chain, fan))
+    graph = load(file)
+    assert len(graph.nodes) == 1 + point.hops
+    assert len(graph.wires) == point.hops
+
+
+def test_the_graph_of_a_cane_that_plays_a_walk(tmp_path: Path) -> None:
+    file = tmp_path / "cane.yaml"
+    text = canes.FLOW.replace("{number}", "1").replace("{here}", str(HERE)).replace("{walk}", "walk.mcap")
+    file.write_text(text.replace("{method}", "best"))
+    assert set(load(file).nodes) == {"walk", "ground_speed", "fusion"}
