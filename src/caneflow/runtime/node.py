@@ -53,6 +53,9 @@ from caneflow.runtime.stages.tap import Tap
 log = logging.getLogger(__name__)
 
 REPORT_PERIOD = 0.02  # s between two progress marks under load
+LIVE_REPORT_PERIOD = 0.2  # s, in a live run: who waits for a mark gets it at once
+LIVE_LOOK_PERIOD = 0.1  # s after which a live node looks at what is due by time, though nothing came
+LOOKS_PER_LAG = 5  # and so often within the time that it may wait for an input
 COUNTERS_PERIOD = 1.0  # s
 SAY_AGAIN_PERIOD = 1.0  # s after which a progress mark is said again: the last one may have met a broken link
 ASK_PERIOD = 0.3  # s between two requests for samples that have not come
@@ -150,7 +153,7 @@ class _ReaderNode(ABC):
         self.plan = plan
         self.bus = bus
         self.reader = reader
-        self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else 5 * REPORT_PERIOD)
+        self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else LIVE_REPORT_PERIOD)
         self.stopped = False
         self._delays = {port: RecentDelays(live=not plan.replay) for port in plan.inputs}
         self._missing: dict[str, _Missing] = {}
@@ -160,6 +163,8 @@ class _ReaderNode(ABC):
         self.lock = threading.RLock()  # over all of this node's state
         self._quick = not plan.replay  # a replay may block while it sends, which Zenoh's threads must not
         self._slow = 0.0  # share of events
+        lags = [1e-3 * wire.max_lag_ms / LOOKS_PER_LAG for wire in plan.inputs.values() if wire.max_lag_ms is not None]
+        self.look_period = REPORT_PERIOD if plan.replay else max(min([LIVE_LOOK_PERIOD, *lags]), REPORT_PERIOD / 4)
         self._came = False  # anything, at once, since this was last looked at
         for port, arrivals in reader.inputs.items():
             arrivals.patient = True
@@ -190,6 +195,8 @@ class _ReaderNode(ABC):
             try:
                 if type(event) is Arrived:  # as nearly all are
                     self.take_sample(event)
+                    if self.reader.inputs[event.port].ahead:
+                        self.ask_for_missing()
                 else:
                     self.take(event)
                 self.follow_up(event)
@@ -314,7 +321,7 @@ class _OperatorNode(_ReaderNode):
             with self.lock:
                 self.send_again()
         while not self.stopped:
-            self.take_events(timeout=REPORT_PERIOD)
+            self.take_events(timeout=self.look_period)
             with self.lock:
                 self.handle_what_is_due()
                 self.ask_for_missing()
@@ -436,7 +443,7 @@ class _SinkNode(_ReaderNode):
             self.bus.at_once = self.take_at_once
             self.bus.declare_ready()
             while not self.stopped:
-                came = self.take_events(timeout=REPORT_PERIOD)
+                came = self.take_events(timeout=self.look_period)
                 with self.lock:
                     self.go_on(came)
         finally:
@@ -483,7 +490,7 @@ class _SourceNode:
         self.source = source
         self.feed = Feed(plan.node, plan.outputs, ordered=source.ordered)
         self.history = History({port: out.readers for port, out in plan.outputs.items()})
-        self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else 5 * REPORT_PERIOD)
+        self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else LIVE_REPORT_PERIOD)
         self.started = False
         self.stopped = False
         self.until = BEGIN if plan.replay else END  # how far a replay may send
