@@ -1,0 +1,138 @@
+"""A live node takes samples on the thread that brings them while it is quick, and in its own turn once it is not."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from caneflow.messages import GroundSpeed, Imu, Sample, numbered
+from caneflow.runtime import Emitted, Operator, node
+from caneflow.runtime.hosts.bus import Arrived, Broken, Event
+from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
+
+PLAN = NodePlan(
+    flow="f",
+    node="echo",
+    inputs={"imu": InputPlan(key="f/imu/imu", schema="caneflow.Imu/1", writer="imu")},
+    outputs={"speed": OutputPlan(key="f/echo/speed", schema="caneflow.GroundSpeed/1", awaited=False)},
+)
+TIMES = 64  # events, over which slowness is judged
+
+
+class Clock:
+    """Time that passes only when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def time_ns(self) -> int:
+        return round(self.now * 1e9)
+
+
+class Echo(Operator):
+    """Says each gyro x as a speed, and takes its time over it."""
+
+    inputs = {"imu": Imu}
+    outputs = {"speed": GroundSpeed}
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self.takes = clock, 0.0
+        self.threads: list[int] = []
+
+    def handle(self, port: str, message: Sample) -> Emitted:
+        self.clock.now += self.takes
+        self.threads.append(threading.get_ident())
+        assert isinstance(message, Imu)
+        if message.gyro[0] < 0:
+            raise ZeroDivisionError("a bug of the operator's")
+        yield "speed", GroundSpeed(stamp=message.stamp, speed=message.gyro[0], quality=0.0, rays=1, valid=True)
+
+
+class Bus:
+    """What a node needs of a bus, without Zenoh."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+        self.inbox: list[Event] = []
+
+    def send(self, port: str, payload: bytes) -> None:
+        self.sent.append(payload)
+
+    def put(self, event: Event) -> None:
+        self.inbox.append(event)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(node, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def made(clock: Clock, tmp_path: Path) -> Callable[..., tuple[Any, Bus, Echo]]:
+    def make(*, replay: bool = False) -> tuple[Any, Bus, Echo]:
+        bus: Any = Bus()
+        plan = NodePlan(flow="f", node="echo", inputs=PLAN.inputs, outputs=PLAN.outputs, replay=replay)
+        echo = Echo(clock)
+        return node._OperatorNode(plan, bus, echo, tmp_path / "echo.snapshot"), bus, echo
+
+    return make
+
+
+def arrival(seq: int, x: float = 1.0) -> Arrived:
+    stamp = 10_000_000 * (seq + 1)
+    return Arrived("imu", numbered(Imu(stamp=stamp, gyro=(x, 0.0, 0.0)), seq), "caneflow.Imu/1")
+
+
+def test_while_it_is_quick_what_follows_is_sent_before_the_bringing_thread_goes_on(made: Any) -> None:
+    host, bus, echo = made()
+    for seq in range(3):
+        assert host.take_at_once(arrival(seq))
+        assert len(bus.sent) == seq + 1
+    assert set(echo.threads) == {threading.get_ident()}
+    assert not bus.inbox
+
+
+def test_a_slow_one_is_left_to_its_own_thread_for_good(made: Any) -> None:
+    host, _, echo = made()
+    echo.takes = 1.01 * node.QUICK
+    taken = sum(host.take_at_once(arrival(seq)) for seq in range(2 * TIMES))
+    assert 1 < taken < TIMES // 2, "some slow ones are forgiven, not many"
+    echo.takes = 0.0
+    assert not host.take_at_once(arrival(2 * TIMES))
+
+
+def test_one_slow_event_in_five_is_forgiven(made: Any) -> None:
+    host, _, echo = made()
+    for seq in range(10 * TIMES):
+        echo.takes = 10 * node.QUICK if seq % 5 == 0 else 0.0
+        assert host.take_at_once(arrival(seq))
+
+
+def test_what_an_operator_raises_is_raised_on_the_nodes_own_thread(made: Any) -> None:
+    host, bus, _ = made()
+    assert host.take_at_once(arrival(0, x=-1.0))
+    (broken,) = bus.inbox
+    assert isinstance(broken, Broken)
+    with pytest.raises(ZeroDivisionError, match="a bug of the operator's"):
+        host.take(broken)
+    assert not host.take_at_once(arrival(1)), "nothing is handled after it"
+
+
+def test_a_replay_takes_nothing_at_once(made: Any) -> None:
+    host, bus, _ = made(replay=True)
+    assert not host.take_at_once(arrival(0))
+    assert not bus.sent
+
+
+def test_after_its_end_a_node_takes_no_more(made: Any) -> None:
+    host, bus, _ = made()
+    host.take_no_more()
+    assert not host.take_at_once(arrival(0))
+    assert not bus.sent
