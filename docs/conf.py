@@ -17,7 +17,7 @@ myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 3
 html_theme = "furo"
 html_title = "caneflow"
-exclude_patterns = ["performance_peers.md"]  # part of performance.md
+exclude_patterns = ["performance_peers.md", "performance_scaling.md"]  # parts of performance.md
 suppress_warnings = ["myst.xref_missing"]  # links to files of the repository that are no pages of the site
 
 reference_pages.write(Path(__file__).parent / "reference")
