@@ -55,6 +55,7 @@ bench: $(BIN)/.installed
 	$(BIN)/pytest --benchmark-enable --benchmark-only
 	$(BIN)/pip install --quiet --editable '.[peers]'
 	$(BIN)/python -m benchmarks.peers --write docs/performance_peers.md
+	$(BIN)/python -m benchmarks.scaling --write docs/performance_scaling.md
 
 clean:
 	rm -rf $(VENV) build

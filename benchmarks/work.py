@@ -102,7 +102,7 @@ class Notes:
     def write(self) -> None:
         """Put the notes where the benchmark waits for them."""
         path = Path(self.job.folder) / "notes.json"
-        fresh = path.with_suffix(".new")
+        fresh = path.with_suffix(f".{os.getpid()}")  # several sinks may write theirs
         said = {"latencies": self.latencies, "seqs": self.seqs, "first": self.first, "last": self.last}
         fresh.write_text(json.dumps(said))
         fresh.replace(path)
