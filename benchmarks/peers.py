@@ -140,9 +140,13 @@ def versions() -> Iterator[str]:
 
 
 def plain(found: Mapping[str, Found]) -> dict[str, dict[str, dict[str, list[dict[str, float]]]]]:
-    """All figures, for JSON."""
+    """All figures, for JSON; what processes printed is of one machine, and stays there."""
+
+    def figures(run: Measured) -> dict[str, float]:
+        return {key: value for key, value in asdict(run).items() if key != "said"}
+
     return {
-        part: {job: {name: [asdict(run) for run in runs] for name, runs in by.items()} for job, by in jobs.items()}
+        part: {job: {name: [figures(run) for run in runs] for name, runs in by.items()} for job, by in jobs.items()}
         for part, jobs in found.items()
     }
 

@@ -54,7 +54,7 @@ def test_remembers_the_newest_only() -> None:
     for k in range(1000):
         history.add(k * 10 * MS, from_yaw(0.001 * k), (0.0, 0.0, 0.1))
     assert history.at(999 * 10 * MS) == from_yaw(0.999)
-    assert history.at(905 * 10 * MS) is not None
+    assert history.at(905 * 10 * MS) == from_yaw(0.905)
     assert history.at(700 * 10 * MS) is None
     assert len(history._stamps) < 200
     assert history.mean_turn_rate(910 * 10 * MS, 990 * 10 * MS) == pytest.approx(0.1)

@@ -26,6 +26,12 @@ def test_what_costs_more_than_it_may_is_named_with_its_ratio() -> None:
         assert [line.partition(";")[0] for line in peers.regressions(found)] == said
 
 
+def test_what_is_written_down_are_figures_and_nothing_that_processes_printed() -> None:
+    noisy = Measured(p50=1.0, p99=2.0, cpu=3.0, rate=4.0, lost=0.0, start_up=5.0, said="Traceback: in /a/folder/here")
+    (written,) = peers.plain({"hop": {"IMU": {"dora": [noisy]}}})["hop"]["IMU"]["dora"]
+    assert written == {"p50": 1.0, "p99": 2.0, "cpu": 3.0, "rate": 4.0, "lost": 0.0, "start_up": 5.0}
+
+
 @pytest.mark.parametrize(("chain", "fan"), [(1, 1), (20, 1), (1, 20)])
 def test_the_graphs_that_grow(chain: int, fan: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     point = scaling.Point(x=1.0, job=scaling.imu(100.0), chain=chain, fan=fan)
