@@ -26,6 +26,7 @@ struct timer {
 #define TIMER0 ((struct timer *)0x40000000)
 
 #define INTERRUPTS_ENABLED ((volatile uint32_t *)0xe000e100)
+#define INTERRUPTS_PENDING ((volatile uint32_t *)0xe000e200)
 #define UART0_RX 0 /* number of its interrupt */
 
 #define QUEUE 512 /* bytes, a power of two: 5.5 ms at the baud rate */
@@ -33,24 +34,25 @@ struct timer {
 static uint8_t queue[QUEUE];
 static volatile uint32_t queue_in, queue_out; /* counted up without end */
 static volatile bool attention;               /* since the program slept there is something to do */
-static volatile uint32_t lost;
-static uint32_t asleep; /* ticks */
+static volatile bool waits;                   /* a byte is still in the UART, as the queue had no room for it */
+static uint32_t lost, asleep;                 /* bytes; ticks */
 
 void on_uart_received(void);
 void on_reset(void);
 int main(void);
 
+/* A byte for which the queue has no room stays where it is: lost is only what the next one overruns, and an emulator,
+   which waits for the register to be read, loses nothing however fast it brings the bytes. */
 void on_uart_received(void)
 {
     UART0->interrupt = RX_INTERRUPT; /* cleared first: a byte that comes from here on raises it again */
-    uint8_t byte = (uint8_t)UART0->data;
     uint32_t in = queue_in, waiting = in - queue_out;
-    if (waiting < QUEUE) {
-        queue[in % QUEUE] = byte;
-        queue_in = in + 1;
-    } else {
-        lost++;
-    }
+    waits = waiting == QUEUE;
+    if (waits)
+        return;
+    uint8_t byte = (uint8_t)UART0->data;
+    queue[in % QUEUE] = byte;
+    queue_in = in + 1;
     if (byte == 0 || waiting >= QUEUE / 2) /* the end of a frame is worth waking up for, single bytes are not */
         attention = true;
 }
@@ -75,6 +77,10 @@ size_t board_read(const uint8_t **data)
 void board_taken(size_t size)
 {
     queue_out += size;
+    __asm__ volatile("cpsid i" ::: "memory"); /* so that a byte that comes now does not make a second interrupt of it */
+    if (waits)
+        *INTERRUPTS_PENDING = 1U << UART0_RX;
+    __asm__ volatile("cpsie i" ::: "memory");
 }
 
 void board_write(const uint8_t *data, size_t size)
