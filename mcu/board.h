@@ -14,6 +14,6 @@ void board_wait(void);                   /* sleeps until there may be something 
 uint32_t board_ticks(void); /* of a clock that goes up and wraps */
 uint32_t board_ticks_per_second(void);
 uint32_t board_busy_ticks(void); /* ticks spent awake; wraps */
-uint32_t board_lost_bytes(void); /* bytes that came while there was no room for them */
+uint32_t board_lost_bytes(void); /* bytes that the next one overran, as there was no room for them */
 
 #endif

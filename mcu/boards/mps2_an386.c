@@ -31,11 +31,14 @@ struct timer {
 
 #define QUEUE 512 /* bytes, a power of two: 5.5 ms at the baud rate */
 
-static uint8_t queue[QUEUE];
-static volatile uint32_t queue_in, queue_out; /* counted up without end */
-static volatile bool attention;               /* since the program slept there is something to do */
-static volatile bool waits;                   /* a byte is still in the UART, as the queue had no room for it */
-static uint32_t lost, asleep;                 /* bytes; ticks */
+/* What the interrupt and the program share; in one place, as finding another costs instructions for every byte. */
+static volatile struct {
+    uint32_t in, out; /* of the queue, counted up without end */
+    bool attention;   /* since the program slept there is something to do */
+    bool waits;       /* a byte is still in the UART, as the queue had no room for it */
+    uint8_t queue[QUEUE];
+} received;
+static uint32_t lost, asleep; /* bytes; ticks */
 
 void on_uart_received(void);
 void on_reset(void);
@@ -46,15 +49,16 @@ int main(void);
 void on_uart_received(void)
 {
     UART0->interrupt = RX_INTERRUPT; /* cleared first: a byte that comes from here on raises it again */
-    uint32_t in = queue_in, waiting = in - queue_out;
-    waits = waiting == QUEUE;
-    if (waits)
+    uint32_t in = received.in, waiting = in - received.out;
+    bool full = waiting == QUEUE;
+    received.waits = full;
+    if (full)
         return;
     uint8_t byte = (uint8_t)UART0->data;
-    queue[in % QUEUE] = byte;
-    queue_in = in + 1;
+    received.queue[in % QUEUE] = byte;
+    received.in = in + 1;
     if (byte == 0 || waiting >= QUEUE / 2) /* the end of a frame is worth waking up for, single bytes are not */
-        attention = true;
+        received.attention = true;
 }
 
 void board_start(void)
@@ -69,16 +73,16 @@ void board_start(void)
 
 size_t board_read(const uint8_t **data)
 {
-    uint32_t out = queue_out, size = queue_in - out, until_wrap = QUEUE - out % QUEUE;
-    *data = queue + out % QUEUE;
+    uint32_t out = received.out, size = received.in - out, until_wrap = QUEUE - out % QUEUE;
+    *data = (const uint8_t *)received.queue + out % QUEUE; /* none of these is written before board_taken */
     return size < until_wrap ? size : until_wrap;
 }
 
 void board_taken(size_t size)
 {
-    queue_out += size;
+    received.out += size;
     __asm__ volatile("cpsid i" ::: "memory"); /* so that a byte that comes now does not make a second interrupt of it */
-    if (waits)
+    if (received.waits)
         *INTERRUPTS_PENDING = 1U << UART0_RX;
     __asm__ volatile("cpsie i" ::: "memory");
 }
@@ -96,16 +100,15 @@ void board_wait(void)
 {
     /* With interrupts masked nothing can come between the look at the flag and the sleep; one ends it all the same. */
     uint32_t slept = 0;
-    while (!attention) {
-        __asm__ volatile("cpsid i" ::: "memory");
-        if (!attention) {
-            uint32_t began = board_ticks();
-            __asm__ volatile("dsb\n\twfi" ::: "memory");
-            slept += board_ticks() - began;
-        }
-        __asm__ volatile("cpsie i\n\tisb" ::: "memory");
+    __asm__ volatile("cpsid i" ::: "memory");
+    while (!received.attention) {
+        uint32_t began = TIMER0->value;
+        __asm__ volatile("dsb\n\twfi" ::: "memory");
+        slept += began - TIMER0->value; /* it counts down */
+        __asm__ volatile("cpsie i\n\tisb\n\tcpsid i" ::: "memory");
     }
-    attention = false;
+    received.attention = false;
+    __asm__ volatile("cpsie i" ::: "memory");
     asleep += slept;
 }
 
