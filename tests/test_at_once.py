@@ -1,15 +1,17 @@
-"""A live node takes samples on the thread that brings them while it is quick, and in its own turn once it is not."""
+"""A node takes samples on the thread that brings them: live while it is quick, in a replay always."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
+import zenoh
 
 from caneflow.messages import GroundSpeed, Imu, Sample, numbered
+from caneflow.messages.control import Again, PortMark, Progress
 from caneflow.runtime import Emitted, Operator, node
-from caneflow.runtime.hosts.bus import Arrived, Broken, Event
+from caneflow.runtime.hosts.bus import Answered, Arrived, Asked, Broken, Event, Marked
 from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
 
 PLAN = NodePlan(
@@ -59,9 +61,28 @@ class Bus:
     def __init__(self) -> None:
         self.sent: list[bytes] = []
         self.inbox: list[Event] = []
+        self.told: list[Progress] = []
+        self.asked: list[int] = []
+        self.answers: list[list[bytes]] = []
 
     def send(self, port: str, payload: bytes) -> None:
         self.sent.append(payload)
+
+    def send_progress(self, progress: Progress) -> None:
+        self.told.append(progress)
+
+    def ask_again(self, port: str, first: int) -> None:
+        self.asked.append(first)
+
+    def answer(self, asked: Asked, payloads: list[bytes], end: Again) -> None:
+        self.answers.append(payloads)
+
+    def pending(self) -> bool:
+        return bool(self.inbox)
+
+    def events(self, timeout: float | None) -> Iterator[Event]:
+        while self.inbox:
+            yield self.inbox.pop(0)
 
     def put(self, event: Event) -> None:
         self.inbox.append(event)
@@ -125,10 +146,61 @@ def test_what_an_operator_raises_is_raised_on_the_nodes_own_thread(made: Any) ->
     assert not host.take_at_once(arrival(1)), "nothing is handled after it"
 
 
-def test_a_replay_takes_nothing_at_once(made: Any) -> None:
+def test_in_a_replay_however_slow_it_is_samples_are_taken_at_once_and_nothing_else(made: Any) -> None:
+    host, bus, echo = made(replay=True)
+    echo.takes = 10 * node.QUICK
+    for seq in range(2 * TIMES):
+        assert host.take_at_once(arrival(seq))
+    assert len(bus.sent) == 2 * TIMES
+    assert not host.take_at_once(Marked("imu", PortMark(2 * TIMES, 10**12)))
+
+
+def test_between_the_samples_of_a_replay_all_else_is_done(made: Any) -> None:
+    """Samples may come without end: who asks is answered all the same, and how far the node has come is said."""
+    host, bus, echo = made(replay=True)
+    echo.takes = node.REPORT_PERIOD
+    host.take_at_once(arrival(0))
+    bus.inbox.append(Asked("speed", 0, query=cast("zenoh.Query", None)))
+    host.take_at_once(arrival(1))
+    assert [len(each) for each in bus.answers] == [0], "nobody reads it, so nothing is kept for anybody"
+    assert [progress.handled for progress in bus.told] == [10_000_000, 20_000_000]
+
+
+def test_in_a_replay_a_mark_that_overtook_its_samples_asks_for_none_of_them(made: Any, clock: Clock) -> None:
     host, bus, _ = made(replay=True)
-    assert not host.take_at_once(arrival(0))
-    assert not bus.sent
+    host.take(Answered("imu", 0, PortMark(-1, -1)))
+    host.take(Marked("imu", PortMark(99, 10**12)))
+    for seq in range(100):
+        clock.now += 0.9 * node.MARKS_AHEAD
+        host.ask_for_missing()
+        assert host.take_at_once(arrival(seq))
+    assert bus.asked == []
+
+
+def test_in_a_replay_what_does_not_come_is_asked_for_and_waited_for(made: Any, clock: Clock) -> None:
+    host, bus, _ = made(replay=True)
+    host.take(Answered("imu", 0, PortMark(-1, -1)))
+    host.take_at_once(arrival(0))
+    host.take(Marked("imu", PortMark(2, 10**12)))
+    host.ask_for_missing()
+    assert bus.asked == []
+    clock.now += 1.01 * node.MARKS_AHEAD
+    host.ask_for_missing()
+    assert bus.asked == [1]
+    clock.now += 0.9 * node.REPLAY_PATIENCE
+    host.ask_for_missing()
+    assert host.stage.inputs["imu"].counts.lost == 0
+    clock.now += 0.1 * node.REPLAY_PATIENCE
+    host.ask_for_missing()
+    assert host.stage.inputs["imu"].counts.lost == 2
+
+
+def test_a_gap_in_the_numbers_is_asked_for_at_once(made: Any) -> None:
+    host, bus, _ = made(replay=True)
+    host.take(Answered("imu", 0, PortMark(-1, -1)))
+    host.take_at_once(arrival(0))
+    host.take_at_once(arrival(2))
+    assert bus.asked == [1]
 
 
 def test_after_its_end_a_node_takes_no_more(made: Any) -> None:

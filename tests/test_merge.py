@@ -90,3 +90,38 @@ def test_every_arrival_order_gives_the_sorted_order(stamps: list[list[int]], ran
         got += drained(merge)
     expected = sorted((stamp, i) for i, values in enumerate(stamps) for stamp in values)
     assert got == [(f"p{i}", stamp) for stamp, i in expected]
+
+
+@given(
+    marks=st.lists(st.integers(-1, 12), min_size=1, max_size=3),
+    waiting=st.lists(st.booleans(), min_size=3, max_size=3),
+    at=st.integers(0, 2),
+    stamp=st.integers(0, 12),
+)
+def test_a_sample_that_passes_by_is_one_that_would_be_handed_on_next(
+    marks: list[int], waiting: list[bool], at: int, stamp: int
+) -> None:
+    ports = ["a", "b", "c"][: len(marks)]
+    port = ports[at % len(ports)]
+
+    def made() -> Merge:
+        merge = Merge(ports)
+        for each, mark, holds in zip(ports, marks, waiting, strict=False):
+            if holds and mark >= 0:
+                merge.push(each, sample(mark))
+            else:
+                merge.advance(each, mark)
+        return merge
+
+    slow, quick = made(), made()
+    empty = not any(slow.waiting(each) for each in ports)
+    if stamp > slow.watermark(port):
+        slow.push(port, sample(stamp))
+        due = slow.pop() if empty else None
+        expected = due is not None
+    else:
+        expected = False
+    assert quick.pass_by(port, stamp) is expected
+    if expected:
+        assert [quick.watermark(each) for each in ports] == [slow.watermark(each) for each in ports]
+        assert quick.handled() == slow.handled()

@@ -4,6 +4,8 @@ import logging
 from collections.abc import Mapping
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from caneflow.messages import GroundSpeed, Imu, MessageError, Sample
 from caneflow.messages.control import PortMark
@@ -201,3 +203,47 @@ def test_an_operator_whose_stamps_do_not_increase_is_a_bug_that_shows() -> None:
     host.offer("a", imu(10, 0))
     with pytest.raises(DataflowError, match="stamp 10 after 10; stamps of one stream strictly increase"):
         emitted(host)
+
+
+def arrivals() -> st.SearchStrategy[list[tuple[str, int, int, float]]]:
+    """Port, step of the stamp, step of the number and gyro x of each sample: mostly next, some lost, old or refused."""
+    step = st.sampled_from([1, 1, 1, 1, 1, 2, 0, -1])
+    return st.lists(st.tuples(st.sampled_from("ab"), step, step, st.sampled_from([1.0, 1.0, -1.0])), max_size=30)
+
+
+@given(arrivals(), st.lists(st.integers(0, 30), max_size=30), st.one_of(st.none(), st.integers(0, 10**9)))
+def test_at_once_is_the_same_as_in_two_steps(
+    coming: list[tuple[str, int, int, float]], marks: list[int], now: int | None
+) -> None:
+    """Whatever comes: the same follows, and the same is counted."""
+    ways: list[tuple[Stage, list[tuple[int, int]]]] = [(stage(max_age_ms=1e-5), []) for _ in range(2)]
+    at, seq = dict.fromkeys("ab", 0), dict.fromkeys("ab", -1)
+    for k, (port, stamp_step, seq_step, x) in enumerate(coming):
+        at[port] += stamp_step
+        seq[port] = max(0, seq[port] + seq_step)
+        message = imu(max(0, at[port]), seq[port], x)
+        for quick, (host, found) in enumerate(ways):
+            followed = host.handle_at_once(port, message, now) if quick else None
+            if followed is None:
+                host.offer(port, message)
+                found += emitted(host, now)
+            else:
+                found += [(each.stamp, number) for _, each, number in followed]
+            if k < len(marks):
+                host.mark("b", PortMark(seq["b"] + 1 - marks[k] % 2, marks[k]))
+                found += emitted(host, now)
+    (slow, from_slow), (fast, from_fast) = ways
+    assert from_fast == from_slow
+    assert fast.input_counts() == slow.input_counts()
+    assert fast.state() == slow.state()
+
+
+def test_an_older_mark_does_not_replace_the_one_that_waits() -> None:
+    host = stage()
+    host.close("b")
+    host.mark("a", PortMark(1, END))
+    host.mark("a", PortMark(1, 15))
+    host.offer("a", imu(10, 0))
+    host.offer("a", imu(20, 1))
+    emitted(host)
+    assert host.finished

@@ -59,6 +59,7 @@ LOOKS_PER_LAG = 5  # and so often within the time that it may wait for an input
 COUNTERS_PERIOD = 1.0  # s
 SAY_AGAIN_PERIOD = 1.0  # s after which a progress mark is said again: the last one may have met a broken link
 ASK_PERIOD = 0.3  # s between two requests for samples that have not come
+MARKS_AHEAD = 0.1  # s, in a replay: that samples may be underway which a progress mark has overtaken
 LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run
 REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
 SNAPSHOT_PERIOD = 0.5  # s between two snapshots of an operator
@@ -142,8 +143,9 @@ class _Reports:
 class _Missing:
     """Samples that were sent and have not come."""
 
+    expected: int  # seq of the first of them
     since: float  # s, monotonic
-    ask_at: float = 0.0  # s, monotonic
+    ask_at: float  # s, monotonic
 
 
 class _ReaderNode(ABC):
@@ -161,7 +163,7 @@ class _ReaderNode(ABC):
         # have missed its last word, and the link to the writer may not be there yet.
         self._unanswered = dict.fromkeys(plan.inputs, 0.0)  # s, monotonic: when to ask next
         self.lock = threading.RLock()  # over all of this node's state
-        self._quick = not plan.replay  # a replay may block while it sends, which Zenoh's threads must not
+        self._quick = True
         self._slow = 0.0  # share of events
         lags = [1e-3 * wire.max_lag_ms / LOOKS_PER_LAG for wire in plan.inputs.values() if wire.max_lag_ms is not None]
         self.look_period = REPORT_PERIOD if plan.replay else max(min([LIVE_LOOK_PERIOD, *lags]), REPORT_PERIOD / 4)
@@ -181,12 +183,13 @@ class _ReaderNode(ABC):
         return came
 
     def take_at_once(self, event: Event) -> bool:
-        """Live, on one of Zenoh's threads: take an event and do what follows; False: not here.
+        """Take an event and do what follows, on the thread that brought it; False: not here.
 
-        While the node is quick, that spares waking its own thread for every sample. One that is not would hold up
-        everything else on its links, and its queues would not see what waits.
+        That spares waking the node's own thread for every sample. Live it is the thread that receives: a node that is
+        not quick would hold up everything else on its links, and its queues would not see what waits. In a replay a
+        put may block, so samples come on threads of their own, and all else, which does not, is left to the node's.
         """
-        if not self._quick:
+        if not self._quick or (self.plan.replay and type(event) is not Arrived):
             return False
         with self.lock:
             if not self._quick:  # it has ended meanwhile, or become slow
@@ -194,20 +197,31 @@ class _ReaderNode(ABC):
             began = time.monotonic()
             try:
                 if type(event) is Arrived:  # as nearly all are
-                    self.take_sample(event)
-                    if self.reader.inputs[event.port].ahead:
-                        self.ask_for_missing()
+                    self.take_sample_at_once(event)
+                    if self.plan.replay:
+                        self.between_samples()
                 else:
                     self.take(event)
-                self.follow_up(event)
+                    self.follow_up(event)
             except BaseException as error:
                 self._quick = False
                 self.bus.put(Broken(error))
             self._came = True
             self._slow += ((time.monotonic() - began > QUICK) - self._slow) / 64
-            if self._slow > MOST_SLOW:
+            if self._slow > MOST_SLOW and not self.plan.replay:
                 self._quick = False
         return True
+
+    def take_sample_at_once(self, arrived: Arrived) -> None:
+        """Take a sample and do what follows."""
+        self.take(arrived)
+        if self.reader.inputs[arrived.port].ahead:
+            self.ask_for_missing()
+        self.follow_up(arrived)
+
+    @abstractmethod
+    def between_samples(self) -> None:
+        """In a replay, whose samples may come without end: do what else the node's own thread does."""
 
     @abstractmethod
     def follow_up(self, event: Event) -> None:
@@ -221,7 +235,9 @@ class _ReaderNode(ABC):
     def take(self, event: Event) -> None:
         match event:
             case Arrived():
-                self.take_sample(event)
+                message = self.decoded(event)
+                if message is not None:
+                    self.take_message(event, message)
             case Answered():
                 self._unanswered.pop(event.port, None)
                 self.reader.mark(event.port, event.mark)
@@ -247,21 +263,22 @@ class _ReaderNode(ABC):
             if wire.clock == clock.there:
                 self.reader.inputs[port].clock_offset = round(now * 1e9)
 
-    def take_sample(self, arrived: Arrived) -> None:
+    def decoded(self, arrived: Arrived) -> Sample | None:
+        """The sample that came, its delays noted; None when it is refused, and counted."""
         wire = self.plan.inputs[arrived.port]
         try:
             check_schema(arrived, wire)
             message = decode(arrived.payload, wire.kind)
         except MessageError as error:
             self.reader.refuse(arrived.port, error)
-            return
+            return None
         offset = self.reader.inputs[arrived.port].clock_offset
         if not (self.plan.replay or arrived.again):
             self._unanswered.pop(arrived.port, None)  # live: what is missing before it shows by its number
         if offset is not None and (arrived.sent_at or not (self.plan.replay or arrived.again)):
             sent_at = arrived.sent_at and arrived.sent_at - offset
             self._delays[arrived.port].note(time.time_ns(), sent_at, message.stamp - offset)
-        self.take_message(arrived, message)
+        return message
 
     @abstractmethod
     def take_message(self, arrived: Arrived, message: Sample) -> None:
@@ -279,7 +296,11 @@ class _ReaderNode(ABC):
             if before is None:
                 self._missing.pop(port, None)
                 continue
-            missing = self._missing.setdefault(port, _Missing(since=now))
+            missing = self._missing.get(port)
+            if missing is None or missing.expected != arrivals.expected:
+                # In a replay a mark overtakes the samples that it speaks of.
+                ask_at = now + MARKS_AHEAD if self.plan.replay and not arrivals.ahead else now
+                missing = self._missing[port] = _Missing(arrivals.expected, since=now, ask_at=ask_at)
             if now - missing.since > (REPLAY_PATIENCE if self.plan.replay else LIVE_PATIENCE):
                 self.skip_to(port, before)
             elif now >= missing.ask_at:
@@ -330,12 +351,37 @@ class _OperatorNode(_ReaderNode):
         self.take_no_more()
         self.count(self.sent(), at_once=True)
 
+    def take_sample_at_once(self, arrived: Arrived) -> None:
+        message = self.decoded(arrived)
+        if message is None:
+            self.follow_up(arrived)
+            return
+        emitted = self.stage.handle_at_once(arrived.port, message, self.now())
+        if emitted is None:
+            self.take_message(arrived, message)
+            if self.stage.inputs[arrived.port].ahead:
+                self.ask_for_missing()
+            self.follow_up(arrived)
+        else:
+            self.send(emitted)
+            self.tell_who_waits()
+
+    def between_samples(self) -> None:
+        if self.bus.pending():
+            self.take_events(timeout=0)
+            self.handle_what_is_due()
+        self.report_if_due()
+
     def follow_up(self, event: Event) -> None:
         if isinstance(event, Confirmed):
             return
-        while (emitted := self.stage.step(time.time_ns())) is not None:
+        while (emitted := self.stage.step(self.now())) is not None:
             self.send(emitted)
-        if self.stage.tells_more_than_samples():
+        self.tell_who_waits()
+
+    def tell_who_waits(self) -> None:
+        """Say at once how far this node has come, when a reader cannot see it from the samples and waits for it."""
+        if not self.plan.replay and self.stage.tells_more_than_samples():
             self.reports.progress(self.progress())
 
     def take(self, event: Event) -> None:
@@ -359,14 +405,21 @@ class _OperatorNode(_ReaderNode):
         self.stage.skip_to(port, seq)
 
     def handle_what_is_due(self) -> None:
-        now = None if self.plan.replay else time.time_ns()
+        now = self.now()
         while (emitted := self.stage.step(now)) is not None:
             self.send(emitted)
-            if self.reports.due():
-                self.reports.progress(self.progress())
-                self.keep_snapshot()
+            self.report_if_due()
             if self.bus.pending():
                 self.take_events(timeout=0)
+
+    def now(self) -> int | None:
+        """The clock (ns) by which samples may be too old; a replay has none."""
+        return None if self.plan.replay else time.time_ns()
+
+    def report_if_due(self) -> None:
+        if self.reports.due():
+            self.reports.progress(self.progress())
+            self.keep_snapshot()
 
     def send(self, emitted: list[tuple[str, Sample, int]]) -> None:
         for port, message, seq in emitted:
@@ -462,6 +515,12 @@ class _SinkNode(_ReaderNode):
         if self.reports.due() or self.tap.finished:
             self.reports.progress(self.tap.progress())
         self.count({})
+
+    def between_samples(self) -> None:
+        if self.bus.pending():
+            self.take_events(timeout=0)
+        if self.reports.due():
+            self.go_on(came=True)
 
     def follow_up(self, event: Event) -> None:
         """Nothing: a sink has done with a sample when it has taken it."""

@@ -1,11 +1,12 @@
 """One node's place on the bus: its Zenoh session, its keys, and one inbox for everything that comes.
 
-Zenoh's threads put things into the inbox; what they mean is decided on the node's own thread. Live, a node may take
+Zenoh's threads put things into the inbox; what they mean is decided on the node's own thread. But a node may take
 samples at once, on the thread that brought them: waking another one costs more than most operators do.
 """
 
 import logging
 import queue
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -18,7 +19,7 @@ import zenoh
 from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, encode
 from caneflow.messages.control import Again, Clock, Counters, LeftOut, PortMark, Progress, Window
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.links import open_session, sending_now, sent_at
+from caneflow.runtime.hosts.links import KnownThreads, open_session, sending_now, sent_at
 from caneflow.runtime.plan import InputPlan, NodePlan
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
 TIMED_PERIOD = 0.013  # s between two in a live run; odd as well
 ENCODINGS_KEPT = 8
+QUEUE = 1_000_000  # samples of a stream that may wait in a replay: more than its window lets come
 POLL = 0.01  # s between two looks at a condition that Zenoh does not signal
 
 
@@ -114,7 +116,10 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
     """The flow ends: SIGTERM, or Ctrl-C."""
 
 
-Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
+Held: TypeAlias = (
+    "zenoh.Subscriber[None] | zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
+    " | zenoh.Queryable[None] | zenoh.LivelinessToken"
+)
 Event: TypeAlias = (
     Arrived | Answered | Asked | Questioned | Confirmed | Noted | Marked | Timed | Broken | Started | Opened | Stopped
 )
@@ -128,6 +133,7 @@ class Bus:
         self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
         # Takes an event on the thread that brought it; False: it did not, and the event goes into the inbox.
         self.at_once: Callable[[Event], bool] | None = None
+        self._threads = KnownThreads()
         self._session = open_session(listen=plan.links.listen, connect=plan.links.connect, replay=plan.replay)
         # Whatever must outlive its statement: a liveliness token that no variable holds is undeclared at once.
         self._held: list[Held] = []
@@ -239,7 +245,8 @@ class Bus:
         plan = self._plan
         by_writer: dict[str, dict[str, str]] = {}  # writer -> its port -> this node's port
         for port, wire in plan.inputs.items():
-            self._subscribe(wire.key, self._on_sample(port), indirect=not plan.replay)
+            subscribe = self._subscribe_aside if plan.replay else self._subscribe
+            subscribe(wire.key, self._on_sample(port))
             by_writer.setdefault(wire.writer, {})[wire.key.rpartition("/")[2]] = port
         for writer, ports in by_writer.items():
             self._subscribe(control_key(plan.flow, "progress", writer), self._on_progress(ports))
@@ -260,10 +267,22 @@ class Bus:
         if plan.inputs and not plan.outputs:
             self._answer_with(control_key(plan.flow, "ask", plan.node), self._on_question)
 
-    def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None], *, indirect: bool = False) -> None:
-        # Straight on Zenoh's receiving thread, which a put into the inbox does not hold up; or on a thread of its own.
-        handler = zenoh.handlers.Callback(callback, indirect=indirect)
+    def _subscribe(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
+        # Straight on Zenoh's receiving thread: a put into the inbox does not hold it up, nor does a node that is quick.
+        handler = zenoh.handlers.Callback(callback, indirect=False)
         self._held.append(self._session.declare_subscriber(key, handler))
+
+    def _subscribe_aside(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
+        # On a thread of its own, which may block, behind a queue that is never full: Zenoh's default of 256 would block
+        # the receiving thread, and two nodes that wait for each other's would wait for ever.
+        subscriber = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(QUEUE))
+        self._held.append(subscriber)
+
+        def take_all() -> None:
+            for sample in subscriber:  # until it is undeclared
+                callback(sample)
+
+        threading.Thread(target=take_all, name=key, daemon=True).start()
 
     def _answer_with(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
         handler = zenoh.handlers.Callback(callback, indirect=False)
@@ -295,6 +314,7 @@ class Bus:
         schemas: dict[str, str] = {}  # by encoding: there is one, or a few that are wrong
 
         def put(sample: zenoh.Sample) -> None:
+            self._threads.know_this_one()
             encoding = str(sample.encoding)
             schema = schemas.get(encoding)
             if schema is None:

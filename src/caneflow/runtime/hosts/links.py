@@ -4,11 +4,14 @@ The defaults of Zenoh lose data silently: peers do not relay for peers, a lost l
 4 s, a frozen peer is noticed after 10 s, and a put that blocks gives up after 5 s and closes the link.
 """
 
+import ctypes
 import json
+import os
 import random
 import socket
 import time
 from collections.abc import Mapping, Sequence
+from threading import get_ident
 from typing import Any
 
 import zenoh
@@ -32,6 +35,12 @@ PRIORITIES = (
     "data_low",
     "background",
 )
+THREADS = {  # read once by Zenoh, when the first session of a process opens
+    # One thread that waits for all links and takes what comes, instead of one that waits and two that take: none wakes
+    # another for a sample. What is sent has its own.
+    "ZENOH_RUNTIME": "(rx: (worker_threads: 1), net: (handover: rx))",
+    "RUST_MIN_STACK": str(8 * 2**20),  # bytes: operators run on that thread, and Python is used to 8 MiB, not to 2
+}
 RETRY = {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2}
 SENT_AT_BYTES = 8  # of a sample's attachment: ns, little-endian
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ports, so that no outgoing connection takes one
@@ -49,6 +58,8 @@ def open_session(
 
     `more`: further settings of Zenoh, by path.
     """
+    for variable, value in THREADS.items():
+        os.environ.setdefault(variable, value)
     zenoh.init_log_from_env_or("error")
     # Live, a router that waits for a dead link longer than the lease would hold up the nodes that dial it.
     patience = WAIT_BEFORE_CLOSE if replay else LIVE_LEASE * 1_000
@@ -75,6 +86,24 @@ def open_session(
         where = ", ".join((*listen, *connect))
         cause = str(error).partition(" at /")[0].strip()  # Zenoh adds the place in its own source
         raise DataflowError(f"no Zenoh session on {where}: {cause}") from error
+
+
+class KnownThreads:
+    """Those of Zenoh's threads that hold on to what Python keeps for a thread.
+
+    A thread that Python did not start is given a new state for every callback and loses it after: as much work as
+    decoding a sample, and three times that with cold caches.
+    """
+
+    def __init__(self) -> None:
+        self._known: set[int] = set()
+
+    def know_this_one(self) -> None:
+        """Let the thread that calls keep its state as long as it lives."""
+        me = get_ident()
+        if me not in self._known:
+            self._known.add(me)
+            ctypes.pythonapi.PyGILState_Ensure()  # without the release that would end it
 
 
 def sending_now() -> bytes:

@@ -28,6 +28,17 @@ class Merge:
         self._queues[i].append(message)
         self._watermarks[i] = message.stamp
 
+    def pass_by(self, port: str, stamp: int) -> bool:
+        """Whether a sample of `stamp` (ns) on `port` is due at once, past all queues; if so, it counts as handed on."""
+        if any(self._queues):
+            return False
+        own = self._index[port]
+        for i, mark in enumerate(self._watermarks):
+            if mark >= stamp if i == own else mark < (stamp if i < own else stamp - 1):
+                return False
+        self._watermarks[own] = stamp
+        return True
+
     def advance(self, port: str, watermark: int) -> None:
         """Note that no sample with a stamp <= `watermark` (ns) will come on `port`."""
         i = self._index[port]

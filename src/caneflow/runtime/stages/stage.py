@@ -61,7 +61,7 @@ class Stage:
     def mark(self, port: str, mark: PortMark) -> None:
         """Take the writer's word on how far the stream of `port` has come."""
         arrivals = self.inputs[port]
-        arrivals.mark = mark
+        arrivals.note_mark(mark)
         self._count_mark(port, arrivals)
 
     def close(self, port: str) -> None:
@@ -84,17 +84,24 @@ class Stage:
         due = self._merge.pop()
         if due is not None:
             port, message = due
-            arrivals = self.inputs[port]
-            arrivals.note_handled(message)
-            if now is not None and arrivals.too_old(message, now):
-                arrivals.counts.dropped += 1
-                arrivals.leave_out(message, "dropped")
-                return []
-            return self._handled(port, message)
+            return self._handled(port, self.inputs[port], message, now)
         if not self.finished and self._merge.ended:
             self.finished = True
             return [self._numbered(port, message) for port, message in self._operator.finish()]
         return None
+
+    def handle_at_once(self, port: str, message: Sample, now: int | None) -> list[tuple[str, Sample, int]] | None:
+        """`offer` and `step` in one, live, for a sample that is next in its stream and due: what follows from it.
+
+        None: it is not so simple, and nothing was done. It is so nearly always, and three times as fast.
+        """
+        arrivals = self.inputs[port]
+        if arrivals.plan.left_out or not arrivals.is_simply_next(message):
+            return None
+        if not self._merge.pass_by(port, message.stamp):
+            return None
+        arrivals.take_next(message)
+        return self._handled(port, arrivals, message, now)
 
     def progress(self) -> Progress:
         """How far the node has come: what is handled can cause no further output."""
@@ -155,15 +162,22 @@ class Stage:
             self._merge.push(port, message)
             self._keep_length(port, arrivals)
 
-    def _handled(self, port: str, message: Sample) -> list[tuple[str, Sample, int]]:
+    def _handled(
+        self, port: str, arrivals: Arrivals, message: Sample, now: int | None
+    ) -> list[tuple[str, Sample, int]]:
+        arrivals.note_handled(message)
+        if now is not None and arrivals.too_old(message, now):
+            arrivals.counts.dropped += 1
+            arrivals.leave_out(message, "dropped")
+            return []
         emitted = []
         try:
             for out, follows in self._operator.handle(port, message):
                 emitted.append(self._numbered(out, follows))
         except Refused as refused:
-            self.inputs[port].refuse(refused)
+            arrivals.refuse(refused)
         else:
-            self.inputs[port].counts.handled += 1
+            arrivals.counts.handled += 1
         return emitted
 
     def _numbered(self, port: str, message: Sample) -> tuple[str, Sample, int]:

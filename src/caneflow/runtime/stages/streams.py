@@ -56,12 +56,10 @@ class Arrivals:
 
         `again`: it was asked for, so it is no fault if it has come before.
         """
-        self.counts.received += 1
-        if message.seq == self.expected and message.stamp > self.last_stamp and not (self.ahead or self.unreadable):
-            if message.stamp - self.last_stamp > SILENCE:
-                self._note_silence(message)
-            self.expected, self.last_stamp = message.seq + 1, message.stamp  # as it should be, and nearly always is
+        if self.is_simply_next(message):
+            self.take_next(message)
             return [message]
+        self.counts.received += 1
         if message.stamp <= self.last_stamp or message.seq in self.ahead:
             self._refuse_old(message, again=again)
             return []
@@ -70,6 +68,28 @@ class Arrivals:
             return []
         self._note_lost(message.seq)
         return [self._next(message), *self._caught_up()]
+
+    def is_simply_next(self, message: Sample) -> bool:
+        """Whether `message` is as it should be, and nearly always is: next in number and time, with nothing missing.
+
+        And the writer's mark, if one waits, goes on waiting.
+        """
+        return (
+            message.seq == self.expected
+            and 0 < message.stamp - self.last_stamp <= SILENCE
+            and not (self.ahead or self.unreadable)
+            and (self.mark is None or self.mark.last_seq > message.seq)
+        )
+
+    def take_next(self, message: Sample) -> None:
+        """Count a sample that is simply next."""
+        self.counts.received += 1
+        self.expected, self.last_stamp = message.seq + 1, message.stamp
+
+    def note_mark(self, mark: PortMark) -> None:
+        """Take the writer's word on how far it has come, if it is no older than the one that waits."""
+        if self.mark is None or mark.watermark >= self.mark.watermark:
+            self.mark = mark
 
     def skip_to(self, seq: int) -> list[Sample]:
         """Take what is missing before `seq` as lost; the samples that waited for it."""

@@ -24,6 +24,10 @@ class Tap:
     def offer(self, port: str, message: Sample, payload: bytes, time: int, *, again: bool = False) -> None:
         """Take a decoded sample that arrived on `port` at `time` (ns); `again`: it was asked for."""
         arrivals = self.inputs[port]
+        if arrivals.is_simply_next(message):  # as nearly all are
+            arrivals.take_next(message)
+            self._hand_on(port, arrivals, message, payload, time)
+            return
         self._payloads[port][message.seq] = payload
         for each in arrivals.admit(message, again=again):
             self._take(port, each, time)
@@ -38,7 +42,7 @@ class Tap:
 
     def mark(self, port: str, mark: PortMark) -> None:
         """Take the writer's word on how far the stream of `port` has come."""
-        self.inputs[port].mark = mark
+        self.inputs[port].note_mark(mark)
         self._count_mark(port)
 
     def skip_to(self, port: str, seq: int, time: int) -> None:
@@ -87,10 +91,12 @@ class Tap:
         return {port: arrivals.counts for port, arrivals in self.inputs.items()}
 
     def _take(self, port: str, message: Sample, time: int) -> None:
-        arrivals = self.inputs[port]
+        self._hand_on(port, self.inputs[port], message, self._payloads[port].pop(message.seq), time)
+
+    def _hand_on(self, port: str, arrivals: Arrivals, message: Sample, payload: bytes, time: int) -> None:
         arrivals.counts.handled += 1
         arrivals.note_handled(message)
-        self._sink.take(arrivals.plan.key, message, self._payloads[port].pop(message.seq), time)
+        self._sink.take(arrivals.plan.key, message, payload, time)
         self._advance(port, message.stamp)
 
     def _count_mark(self, port: str) -> None:
@@ -99,4 +105,5 @@ class Tap:
             self._advance(port, watermark)
 
     def _advance(self, port: str, watermark: int) -> None:
-        self._watermarks[port] = max(self._watermarks[port], watermark)
+        if watermark > self._watermarks[port]:
+            self._watermarks[port] = watermark
