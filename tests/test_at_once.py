@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import pytest
 import zenoh
 
@@ -52,6 +53,8 @@ class Echo(Operator):
         assert isinstance(message, Imu)
         if message.gyro[0] < 0:
             raise ZeroDivisionError("a bug of the operator's")
+        if message.gyro[0] == 0:
+            return
         yield "speed", GroundSpeed(stamp=message.stamp, speed=message.gyro[0], quality=0.0, rays=1, valid=True)
 
 
@@ -62,6 +65,7 @@ class Bus:
         self.sent: list[bytes] = []
         self.inbox: list[Event] = []
         self.told: list[Progress] = []
+        self.marked: list[Progress] = []
         self.asked: list[int] = []
         self.answers: list[list[bytes]] = []
 
@@ -70,6 +74,9 @@ class Bus:
 
     def send_progress(self, progress: Progress) -> None:
         self.told.append(progress)
+
+    def send_marks(self, progress: Progress) -> None:
+        self.marked.append(progress)
 
     def ask_again(self, port: str, first: int) -> None:
         self.asked.append(first)
@@ -97,9 +104,10 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 @pytest.fixture
 def made(clock: Clock, tmp_path: Path) -> Callable[..., tuple[Any, Bus, Echo]]:
-    def make(*, replay: bool = False) -> tuple[Any, Bus, Echo]:
+    def make(*, replay: bool = False, awaited: bool = False) -> tuple[Any, Bus, Echo]:
         bus: Any = Bus()
-        plan = NodePlan(flow="f", node="echo", inputs=PLAN.inputs, outputs=PLAN.outputs, replay=replay)
+        outputs = {"speed": msgspec.structs.replace(PLAN.outputs["speed"], awaited=awaited)}
+        plan = NodePlan(flow="f", node="echo", inputs=PLAN.inputs, outputs=outputs, replay=replay)
         echo = Echo(clock)
         return node._OperatorNode(plan, bus, echo, tmp_path / "echo.snapshot"), bus, echo
 
@@ -118,6 +126,18 @@ def test_while_it_is_quick_what_follows_is_sent_before_the_bringing_thread_goes_
         assert len(bus.sent) == seq + 1
     assert set(echo.threads) == {threading.get_ident()}
     assert not bus.inbox
+
+
+def test_a_reader_that_waits_hears_at_once_that_nothing_follows_from_a_sample(made: Any) -> None:
+    host, bus, _ = made(awaited=True)
+    host.take_at_once(arrival(0))
+    assert bus.marked == [], "the sample says it"
+    host.take_at_once(arrival(1, x=0.0))
+    (progress,) = bus.marked
+    assert progress.ports["speed"] == PortMark(0, 20_000_000)
+    host.take_at_once(Marked("imu", PortMark(1, 20_000_000)))
+    assert len(bus.marked) == 1, "nothing is said twice"
+    assert bus.told == [], "nobody else is woken"
 
 
 def test_a_slow_one_is_left_to_its_own_thread_for_good(made: Any) -> None:

@@ -314,8 +314,7 @@ def test_a_machine_writes_what_is_its_own_and_nothing_else(target: Target) -> No
         sample_key(flow, "radar", "frame"),
         sample_key(flow, "ground_speed", "speed"),
         *(control_key(flow, word) for word in ("start", "end", "window", "late")),
-        control_key(flow, "progress", "imu"),
-        control_key(flow, "counters", "imu"),
+        *(control_key(flow, word, "imu") for word in ("progress", "marks", "counters")),
         control_key(flow, "failed", "gateway"),
     ]
     with target.session("phone") as phone, target.local() as inside:

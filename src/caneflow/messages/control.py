@@ -20,7 +20,10 @@ class Again(msgspec.Struct, frozen=True, gc=False):
 
 
 class Progress(msgspec.Struct, frozen=True, gc=False):
-    """`@/progress/<node>`: how far a node has come. Sent when it is idle, and under load regularly."""
+    """`@/progress/<node>`: how far a node has come. Sent when it is idle, and under load regularly.
+
+    `@/marks/<node>`: the same, live and at once, heard by the node's readers only: they wait for it.
+    """
 
     node: str
     handled: int  # ns: everything up to this stamp has been handled
@@ -78,6 +81,7 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     refused: int = 0  # what a source brought and that could not be sent
     unsent: dict[str, int] = {}  # the same by output port
     delays: dict[str, Delays] = {}  # by input port; from processes only
+    ended: bool = False  # everything has come, and what followed is sent
 
 
 class Clock(msgspec.Struct, frozen=True, kw_only=True, gc=False):

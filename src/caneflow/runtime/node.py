@@ -317,7 +317,9 @@ class _ReaderNode(ABC):
         now = time.time_ns()
         delays = {port: each.spread(now) for port, each in self._delays.items()}
         counts = self.reader.input_counts()
-        counters = Counters(node=self.plan.node, inputs=counts, outputs=outputs, delays=delays)
+        counters = Counters(
+            node=self.plan.node, inputs=counts, outputs=outputs, delays=delays, ended=self.reader.finished
+        )
         self.reports.counters(counters, at_once=at_once)
 
 
@@ -327,6 +329,7 @@ class _OperatorNode(_ReaderNode):
         super().__init__(plan, bus, self.stage)
         self.history = History({port: out.readers for port, out in plan.outputs.items()})
         self.keeper = SnapshotKeeper(snapshots, operator)
+        self.marked: Progress | None = None  # what readers that wait were told last
         self.confirmed: dict[str, int] = {}  # by input key what the last snapshot has handled
         self._next_snapshot = time.monotonic() + SNAPSHOT_PERIOD
         # Live: for each input that may lag, when the samples of the others came, and their stamps.
@@ -382,7 +385,10 @@ class _OperatorNode(_ReaderNode):
     def tell_who_waits(self) -> None:
         """Say at once how far this node has come, when a reader cannot see it from the samples and waits for it."""
         if not self.plan.replay and self.stage.tells_more_than_samples():
-            self.reports.progress(self.progress())
+            progress = self.stage.progress()
+            if progress != self.marked:
+                self.bus.send_marks(progress)
+                self.marked = progress
 
     def take(self, event: Event) -> None:
         match event:
@@ -618,6 +624,7 @@ class _SourceNode:
         self.count(at_once=True)
         while not self.stopped:
             self.reports.progress(self.feed.progress())
+            self.count()
             self.take_events(timeout=SAY_AGAIN_PERIOD)
 
     @contextmanager
@@ -639,6 +646,11 @@ class _SourceNode:
         sent = {port: out.sent for port, out in self.feed.outputs.items()}
         unsent = self.feed.unsent
         counters = Counters(
-            node=self.plan.node, inputs={}, outputs=sent, refused=self.feed.refused, unsent=dict(unsent)
+            node=self.plan.node,
+            inputs={},
+            outputs=sent,
+            refused=self.feed.refused,
+            unsent=dict(unsent),
+            ended=self.feed.ended,
         )
         self.reports.counters(counters, at_once=at_once)

@@ -140,6 +140,7 @@ class Bus:
         self._listen()
         self._publishers = {port: self._publisher(out.key, out.schema) for port, out in plan.outputs.items()}
         self._progress = self._control_publisher("progress", plan.node)
+        self._marks = self._control_publisher("marks", plan.node)
         self._counters = self._control_publisher("counters", plan.node)
         self._late = self._control_publisher("late")
         self._timed_next = 0.0  # s, monotonic; live
@@ -233,6 +234,10 @@ class Bus:
         """Publish how far this node has come."""
         self._progress.put(encode(progress))
 
+    def send_marks(self, progress: Progress) -> None:
+        """Publish how far this node has come to those of its readers that wait for it."""
+        self._marks.put(encode(progress))
+
     def send_left_out(self, note: LeftOut) -> None:
         """Publish that a sample was not handled."""
         self._late.put(encode(note))
@@ -249,7 +254,8 @@ class Bus:
             subscribe(wire.key, self._on_sample(port))
             by_writer.setdefault(wire.writer, {})[wire.key.rpartition("/")[2]] = port
         for writer, ports in by_writer.items():
-            self._subscribe(control_key(plan.flow, "progress", writer), self._on_progress(ports))
+            for word in ("progress",) if plan.replay else ("progress", "marks"):
+                self._subscribe(control_key(plan.flow, word, writer), self._on_progress(ports))
             # That a writer's question arrives here shows that this side's subscriptions arrived there.
             key = control_key(plan.flow, "edge", writer, plan.node)
             self._answer_with(key, partial(_say_yes, key))

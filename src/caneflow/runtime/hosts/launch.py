@@ -297,7 +297,7 @@ class Launcher:
                 zenoh.handlers.Callback(self._on_status_asked, indirect=False),
             ),
         ]
-        if self._leads:
+        if self._leads and self._deployment.replay:  # live, that a node has ended stands in its counters
             key = control_key(flow, "progress", "*")
             held.append(self._session.declare_subscriber(key, self._hearing(Progress)))
         yield
@@ -378,6 +378,8 @@ class Launcher:
             node.handled = max(node.handled, message.handled)
         else:
             node.counters = message
+            if message.ended:
+                node.handled = END
 
     def _take_ready(self, node: NodeState, *, there: bool) -> None:
         if not there:

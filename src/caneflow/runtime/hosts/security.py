@@ -18,6 +18,7 @@ from caneflow.runtime.plan import NodePlan
 
 Grants: TypeAlias = dict[str, list[str]]  # by kind of message the keys
 
+NODES_WORDS = ("progress", "marks", "counters")  # what a node says of itself, under `@/<word>/<node>`
 LOCAL = "tcp"  # the links within a machine; those between machines are TLS
 KINDS = (
     "put",
@@ -131,9 +132,9 @@ def machine_grants(deployment: Deployment, site: Site, sender: str, receiver: st
     def control(*parts: str) -> str:
         return control_key(flow, *parts)
 
-    heard = [control("progress", "*"), control("counters", "*")]
+    heard = [control(word, "*") for word in NODES_WORDS]
     heard += [control("failed", "*")] if leads else [control(word) for word in ("start", "window", "end")]
-    told = [control("progress", node) for node in senders] + [control("counters", node) for node in senders]
+    told = [control(word, node) for node in senders for word in NODES_WORDS]
     told += [control(word) for word in ("start", "window", "end")] if leads else [control("failed", sender)]
     told += [control("late")] if receiver in site.recorders else []
     heard += [control("late")] if sender in site.recorders else []
@@ -179,7 +180,7 @@ def observed_grants(deployment: Deployment, site: Site, machine: str) -> Grants:
     """What `machine` may send to observers behind a router: all that is its own."""
     flow = deployment.flow
     nodes = _nodes_on(deployment, site, machine)
-    counted = [control_key(flow, word, node) for node in nodes for word in ("progress", "counters")]
+    counted = [control_key(flow, word, node) for node in nodes for word in NODES_WORDS]
     status = [control_key(flow, "status")]
     return {"put": [*_written_on(deployment, site, machine), *counted], "declare_queryable": status, "reply": status}
 
