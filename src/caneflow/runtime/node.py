@@ -506,6 +506,7 @@ class _SinkNode(_ReaderNode):
                 with self.lock:
                     self.go_on(came)
         finally:
+            self.bus.hear_out()
             self.take_no_more()
             self.tap.finish()
         self.count({}, at_once=True)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from types import TracebackType
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import msgspec
 import zenoh
@@ -32,6 +32,7 @@ TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so tha
 TIMED_PERIOD = 0.013  # s between two in a live run; odd as well
 ENCODINGS_KEPT = 8
 QUEUE = 1_000_000  # samples of a stream that may wait in a replay: more than its window lets come
+HEARING_OUT = 1.0  # s, at most, for what has come when a node is to end
 POLL = 0.01  # s between two looks at a condition that Zenoh does not signal
 
 
@@ -116,10 +117,7 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
     """The flow ends: SIGTERM, or Ctrl-C."""
 
 
-Held: TypeAlias = (
-    "zenoh.Subscriber[None] | zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
-    " | zenoh.Queryable[None] | zenoh.LivelinessToken"
-)
+Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
 Event: TypeAlias = (
     Arrived | Answered | Asked | Questioned | Confirmed | Noted | Marked | Timed | Broken | Started | Opened | Stopped
 )
@@ -137,6 +135,7 @@ class Bus:
         self._session = open_session(listen=plan.links.listen, connect=plan.links.connect, replay=plan.replay)
         # Whatever must outlive its statement: a liveliness token that no variable holds is undeclared at once.
         self._held: list[Held] = []
+        self._aside: list[tuple[zenoh.Subscriber[Any], threading.Thread]] = []
         self._listen()
         self._publishers = {port: self._publisher(out.key, out.schema) for port, out in plan.outputs.items()}
         self._progress = self._control_publisher("progress", plan.node)
@@ -152,6 +151,7 @@ class Bus:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.hear_out()
         for held in self._held:  # first, or Zenoh reports what still comes for a session that is closing
             held.undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
         self._session.close()  # type: ignore[no-untyped-call]  # the stub lacks its types
@@ -163,6 +163,14 @@ class Bus:
                 self._wait_for_reader(reader)
         key = control_key(self._plan.flow, "ready", self._plan.node)
         self._held.append(self._session.liveliness().declare_token(key))
+
+    def hear_out(self) -> None:
+        """End the threads that samples come on, once they have brought what has come."""
+        for subscriber, _ in self._aside:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
+        for _, thread in self._aside:
+            thread.join(HEARING_OUT)
+        self._aside.clear()
 
     def put(self, event: Event) -> None:
         """Add an event of this process's own; safe in a signal handler."""
@@ -282,13 +290,14 @@ class Bus:
         # On a thread of its own, which may block, behind a queue that is never full: Zenoh's default of 256 would block
         # the receiving thread, and two nodes that wait for each other's would wait for ever.
         subscriber = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(QUEUE))
-        self._held.append(subscriber)
 
         def take_all() -> None:
-            for sample in subscriber:  # until it is undeclared
+            for sample in subscriber:  # until it is undeclared, and then what had come
                 callback(sample)
 
-        threading.Thread(target=take_all, name=key, daemon=True).start()
+        thread = threading.Thread(target=take_all, name=key, daemon=True)
+        thread.start()
+        self._aside.append((subscriber, thread))
 
     def _answer_with(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
         handler = zenoh.handlers.Callback(callback, indirect=False)

@@ -1,0 +1,71 @@
+"""A node's place on the bus: on whose thread samples come, and that what has come is taken before the end."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import zenoh
+
+from caneflow.messages import control_key
+from caneflow.runtime.hosts.bus import Arrived, Bus, Event, Started
+from caneflow.runtime.hosts.links import Ports, open_session
+from caneflow.runtime.plan import InputPlan, Links, NodePlan
+from tests.flows import wait_for
+
+KEY = "f/imu/imu"
+SAMPLES = 2000  # more than the 256 that Zenoh's own queue takes
+
+
+@contextmanager
+def met(*, replay: bool) -> Iterator[tuple[Bus, zenoh.Session]]:
+    """A reader's bus, and its writer's session."""
+    ports = Ports()
+    endpoint = ports.endpoint()
+    inputs = {"imu": InputPlan(key=KEY, schema="caneflow.Imu/1", writer="imu")}
+    plan = NodePlan(flow="f", node="sink", replay=replay, inputs=inputs, links=Links(listen=(endpoint,)))
+    with Bus(plan) as bus, open_session(connect=[endpoint], replay=replay) as writer:
+        yield bus, writer
+    ports.release()
+
+
+def say(writer: zenoh.Session, count: int) -> None:
+    """Samples, and after them, on the same link, the word to start."""
+    block = zenoh.CongestionControl.BLOCK
+    publisher = writer.declare_publisher(KEY, congestion_control=block)
+    wait_for(lambda: publisher.matching_status.matching, "the subscription to arrive")  # type: ignore[attr-defined]  # the stub says bool
+    for number in range(count):
+        publisher.put(str(number))
+    writer.put(control_key("f", "start"), b"", congestion_control=block)
+
+
+def test_what_has_come_in_a_replay_is_taken_before_the_end() -> None:
+    taken: list[int] = []
+    free = threading.Event()
+
+    def take(event: Event) -> bool:
+        free.wait(30)
+        assert isinstance(event, Arrived)
+        taken.append(int(event.payload))
+        return True
+
+    with met(replay=True) as (bus, writer):
+        bus.at_once = take
+        say(writer, SAMPLES)
+        events = bus.events(30)
+        assert isinstance(next(events), Started), "a sample that is being taken holds nothing else up"
+        assert taken == []
+        free.set()
+        bus.hear_out()
+    assert taken == list(range(SAMPLES))
+
+
+@pytest.mark.parametrize("replay", [False, True])
+def test_what_is_not_taken_at_once_waits_in_the_inbox(replay: bool) -> None:
+    with met(replay=replay) as (bus, writer):
+        bus.at_once = lambda _: False
+        say(writer, 3)
+        came: list[Event] = []
+        while sum(isinstance(event, Arrived) for event in came) < 3:
+            came += bus.events(30)
+        assert [event.payload for event in came if isinstance(event, Arrived)] == [b"0", b"1", b"2"]
