@@ -50,12 +50,14 @@ mcu-test: $(BIN)/.installed
 	$(MAKE) -C mcu size CANEFLOW=$(abspath $(BIN))/caneflow
 	$(BIN)/pytest tests/test_luenberger_fixed.py tests/test_uart_frames.py tests/test_uart_gateway.py tests/test_mcu.py
 
-# On a machine that does nothing else: what a sample costs part by part, then a hop beside raw Zenoh and dora.
-bench: $(BIN)/.installed
+# On a machine that does nothing else: what a sample costs part by part, a hop beside raw Zenoh and dora, how that grows,
+# and the pipeline as a whole.
+bench: $(BIN)/.installed $(WALK)
 	$(BIN)/pytest --benchmark-enable --benchmark-only
 	$(BIN)/pip install --quiet --editable '.[peers]'
 	$(BIN)/python -m benchmarks.peers --write docs/performance_peers.md
 	$(BIN)/python -m benchmarks.scaling --write docs/performance_scaling.md
+	$(BIN)/python -m benchmarks.pipeline $(WALK) --write docs/performance_pipeline.md
 
 clean:
 	rm -rf $(VENV) build

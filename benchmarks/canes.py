@@ -44,8 +44,13 @@ def main() -> None:
     options = parser.parse_args()
     for canes in options.canes:
         with tempfile.TemporaryDirectory() as folder:
-            text = FLOW.replace("{method}", options.method).replace("{walk}", str(options.walk.resolve()))
-            print(json.dumps(measured(Path(folder), text.replace("{here}", str(HERE)), canes, options.seconds)))
+            text = graph(options.walk, options.method)
+            print(json.dumps(measured(Path(folder), text, canes, options.seconds)))
+
+
+def graph(walk: Path, method: str) -> str:
+    """The file of a cane, whose number is still to be filled in."""
+    return FLOW.replace("{method}", method).replace("{walk}", str(walk.resolve())).replace("{here}", str(HERE))
 
 
 def measured(folder: Path, text: str, canes: int, seconds: float) -> dict[str, object]:

@@ -46,7 +46,7 @@ ABOUT = {
 SHOWN = {"hop": ("p50", "p99", "cpu"), "drain": ("rate",), "start": ("start_up", "lost")}
 # Ratios of caneflow to raw Zenoh in the same run that something has to have gone wrong for: a noisy machine moves both.
 BOUNDS = {
-    "hop": {"IMU, 100 Hz": {"cpu": 1.7}, "IMU, 1 kHz": {"p50": 2.0, "cpu": 1.7}, "frame of 480, 100 Hz": {"cpu": 1.7}},
+    "hop": {"IMU, 100 Hz": {"cpu": 1.6}, "IMU, 1 kHz": {"p50": 2.0, "cpu": 1.5}, "frame of 480, 100 Hz": {"cpu": 1.5}},
     "start": {"IMU, 100 Hz": {"start_up": 2.0}},
 }
 RATIOS = {"hop": ("p50", "cpu"), "drain": ("rate",), "start": ("start_up",)}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import canes, peers, scaling
+from benchmarks import canes, peers, pipeline, scaling
 from benchmarks.contenders import HERE
 from benchmarks.measuring import Measured
 from benchmarks.work import VARIABLE
@@ -46,6 +46,26 @@ def test_the_graphs_that_grow(chain: int, fan: int, tmp_path: Path, monkeypatch:
 
 def test_the_graph_of_a_cane_that_plays_a_walk(tmp_path: Path) -> None:
     file = tmp_path / "cane.yaml"
-    text = canes.FLOW.replace("{number}", "1").replace("{here}", str(HERE)).replace("{walk}", "walk.mcap")
-    file.write_text(text.replace("{method}", "best"))
+    file.write_text(canes.graph(Path("walk.mcap"), "best").replace("{number}", "1"))
     assert set(load(file).nodes) == {"walk", "ground_speed", "fusion"}
+
+
+def test_a_fleet_is_computed_from_its_work_until_collecting_it_takes_longer() -> None:
+    """2 s of work and 0.1 s to collect for each of 12 walks: no more than 20 workers' worth, however many there are."""
+    measured = pipeline.Fleet(seconds={1: [25.0, 26.0, 24.0], 2: [13.0, 13.0, 13.0]}, start=1.0, collecting=0.1)
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in pipeline.fleet_table(measured) if "|" in line]
+    by_workers = {row[0]: row[2:] for row in rows[2:]}
+    assert by_workers["1"] == ["**1.00**", f"{10_000 * 2.0 / 60:.3g}"]
+    assert by_workers["2"] == ["**1.92**", f"{10_000 * 1.0 / 60:.3g}"]
+    assert by_workers["8, computed"] == ["8", f"{10_000 * 2.0 / 8 / 60:.3g}"]
+    assert by_workers["64, computed"] == ["20", f"{10_000 * 0.1 / 60:.3g}"]
+
+
+def test_what_canes_lost_is_named() -> None:
+    def measured(p50: float, said: list[str]) -> dict[str, object]:
+        ages = {"p50": p50, "p99": 2 * p50, "max": 3 * p50}
+        return {"stamp_to_recorded_pose_ms": ages, "cpu_of_a_cane_percent": 40.0, "losses_said": said}
+
+    runs = [measured(3.0, []), measured(5.0, ["12 late"]), measured(4.0, [])]
+    assert list(pipeline.cane_figures(runs)) == ["**4** [3..5]", "**8** [6..10]", "40 [40..40]", "12 late"]
+    assert list(pipeline.cane_figures(runs[:1]))[-1] == "none"
