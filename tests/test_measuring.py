@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from benchmarks import canes, peers, pipeline, scaling
-from benchmarks.contenders import HERE
 from benchmarks.measuring import Measured
 from benchmarks.work import VARIABLE
 from caneflow.runtime.dataflow.loading import load
@@ -53,7 +52,8 @@ def test_the_graph_of_a_cane_that_plays_a_walk(tmp_path: Path) -> None:
 def test_a_fleet_is_computed_from_its_work_until_collecting_it_takes_longer() -> None:
     """2 s of work and 0.1 s to collect for each of 12 walks: no more than 20 workers' worth, however many there are."""
     measured = pipeline.Fleet(seconds={1: [25.0, 26.0, 24.0], 2: [13.0, 13.0, 13.0]}, start=1.0, collecting=0.1)
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in pipeline.fleet_table(measured) if "|" in line]
+    page = "\n".join(pipeline.fleet_table(measured)).splitlines()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page if "|" in line]
     by_workers = {row[0]: row[2:] for row in rows[2:]}
     assert by_workers["1"] == ["**1.00**", f"{10_000 * 2.0 / 60:.3g}"]
     assert by_workers["2"] == ["**1.92**", f"{10_000 * 1.0 / 60:.3g}"]
