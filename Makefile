@@ -41,9 +41,12 @@ docs: $(BIN)/.installed
 	$(BIN)/sphinx-build --fail-on-warning --quiet docs build/site
 
 # The long tests: every shared walk at real time and at full speed, calm and under load; kills, freezes, networks; fuzzing
-# with CANEFLOW_FUZZ_TIMES=100 times as many examples as in CI, CANEFLOW_SOAK_MINUTES of random kills.
+# with CANEFLOW_FUZZ_TIMES=100 times as many examples as in CI, CANEFLOW_SOAK_MINUTES of random kills. Property tests, the
+# short ones as well, draw other examples each time.
+soak: export CANEFLOW_EXAMPLES = others
 soak: $(BIN)/.installed
 	$(BIN)/pytest -m long
+	$(BIN)/pytest --numprocesses 2 $$(grep --files-with-matches "@given" tests/test_*.py)
 
 # The firmware: built, measured, booted in an emulator and compared with the model; docs/mcu.md says what that needs.
 mcu-test: $(BIN)/.installed

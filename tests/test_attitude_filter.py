@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from caneflow.algorithms import rotations
@@ -336,6 +336,11 @@ wild = st.tuples(*[st.floats(-1e3, 1e3)] * 3)
     samples=st.lists(
         st.tuples(st.integers(1, 10**9), wild, st.none() | wild, st.none() | wild), min_size=1, max_size=20
     )
+)
+@example(  # a first field of next to nothing, beside which any other deviates beyond all numbers
+    samples=[(1, (0.0, 0.0, 594.0), None, (0.0, 1e-109, 0.0))]
+    + [(1600, (0.0, 656.0, 344.0), None, None)] * 4
+    + [(1, (0.0, 0.0, 0.0), None, (0.0, 0.0, 1.0))]
 )
 @settings(max_examples=50, deadline=None)
 def test_whatever_is_read_the_estimate_is_a_rotation(

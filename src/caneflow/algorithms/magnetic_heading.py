@@ -18,6 +18,7 @@ from caneflow.algorithms.rotations import Vector, wrapped
 SMOOTHING = 0.1  # s, of strength and dip: the magnetometer's noise is no disturbance
 TURNING = math.radians(20.0)  # rad/s; a field that is steady while the body turns is no magnet that it carries
 LARGEST_DISTRUST = 1000.0
+FAR = 10.0  # deviations; one that is further is distrusted no more, and its fourth power may be no number
 SETTLED = 1.5  # times the steady variance, below which corrections are of now, not of what was
 LEVELLING_MEMORY = 1.0  # s of readings that count before the attitude is level
 LEAST_LEVEL = 1e-3  # of the field's strength; a field as steep as that has no yaw
@@ -143,7 +144,7 @@ class MagneticHeading:
             return None
         turn_rate = math.sqrt(gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2])
         self._deviation = self._reference.deviation(strength, math.atan2(-up, level), turn_rate, interval)
-        distrust = min(1.0 + 10.0 * self._deviation**4, LARGEST_DISTRUST)
+        distrust = min(1.0 + 10.0 * min(self._deviation, FAR) ** 4, LARGEST_DISTRUST)
         noise = distrust * self._settings.time_constant**2
         gain = self._gain(noise, interval)
         if not levelled:
