@@ -91,9 +91,9 @@ class Stage:
         return None
 
     def handle_at_once(self, port: str, message: Sample, now: int | None) -> list[tuple[str, Sample, int]] | None:
-        """`offer` and `step` in one, live, for a sample that is next in its stream and due: what follows from it.
+        """`offer` and `step` in one, for a sample that is next in its stream and due: what follows from it.
 
-        None: it is not so simple, and nothing was done. It is so nearly always, and three times as fast.
+        `now` as in `step`. None: it is not so simple, and nothing was done.
         """
         arrivals = self.inputs[port]
         if arrivals.plan.left_out or not arrivals.is_simply_next(message):
