@@ -25,13 +25,21 @@ TIMES = 64  # events, over which slowness is judged
 
 
 class Clock:
-    """Time that passes only when it is told to."""
+    """Time that passes only when it is told to, and the CPU's part of it."""
 
     def __init__(self) -> None:
         self.now = 0.0
+        self.worked = 0.0
+
+    def work(self, seconds: float) -> None:
+        self.now += seconds
+        self.worked += seconds
 
     def monotonic(self) -> float:
         return self.now
+
+    def thread_time(self) -> float:
+        return self.worked
 
     def time_ns(self) -> int:
         return round(self.now * 1e9)
@@ -44,11 +52,12 @@ class Echo(Operator):
     outputs = {"speed": GroundSpeed}
 
     def __init__(self, clock: Clock) -> None:
-        self.clock, self.takes = clock, 0.0
+        self.clock, self.takes, self.waits = clock, 0.0, 0.0
         self.threads: list[int] = []
 
     def handle(self, port: str, message: Sample) -> Emitted:
-        self.clock.now += self.takes
+        self.clock.work(self.takes)
+        self.clock.now += self.waits
         self.threads.append(threading.get_ident())
         assert isinstance(message, Imu)
         if message.gyro[0] < 0:
@@ -147,6 +156,40 @@ def test_a_slow_one_is_left_to_its_own_thread_for_good(made: Any) -> None:
     assert 1 < taken < TIMES // 2, "some slow ones are forgiven, not many"
     echo.takes = 0.0
     assert not host.take_at_once(arrival(2 * TIMES))
+
+
+def test_one_that_the_machine_keeps_waiting_is_not_slow(made: Any) -> None:
+    host, _, echo = made()
+    echo.waits = 0.9 * node.STALLED
+    assert all(host.take_at_once(arrival(seq)) for seq in range(10 * TIMES))
+
+
+def test_one_that_waits_for_long_is_left_to_its_own_thread(made: Any) -> None:
+    host, _, echo = made()
+    echo.waits = 1.1 * node.STALLED
+    assert sum(host.take_at_once(arrival(seq)) for seq in range(2 * TIMES)) < TIMES // 2
+
+
+def test_no_sample_waits_for_the_disk_that_a_snapshot_goes_to(made: Any, clock: Clock) -> None:
+    host, bus, _ = made()
+    host.take_at_once(arrival(0))
+    clock.now += 1.01 * node.LIVE_SNAPSHOT_PERIOD
+    keep, taken = host.keeper.keep, []
+
+    def bring() -> None:
+        taken.append(host.take_at_once(arrival(1)))
+
+    def keep_slowly(snapshot: bytes) -> None:
+        bringing = threading.Thread(target=bring)
+        bringing.start()
+        bringing.join(30)
+        keep(snapshot)
+
+    host.keeper.keep = keep_slowly
+    host.keep_snapshot()
+    assert taken == [True]
+    assert len(bus.sent) == 2
+    assert host.confirmed == {"f/imu/imu": 0}, "the sample that came meanwhile is not in it"
 
 
 def test_one_slow_event_in_five_is_forgiven(made: Any) -> None:

@@ -69,3 +69,11 @@ def test_what_is_not_taken_at_once_waits_in_the_inbox(replay: bool) -> None:
         while sum(isinstance(event, Arrived) for event in came) < 3:
             came += bus.events(30)
         assert [event.payload for event in came if isinstance(event, Arrived)] == [b"0", b"1", b"2"]
+
+
+def test_a_sink_is_not_woken_for_marks_that_only_operators_wait_for() -> None:
+    with met(replay=False) as (_, writer):
+        progress = writer.declare_publisher(control_key("f", "progress", "imu"))
+        marks = writer.declare_publisher(control_key("f", "marks", "imu"))
+        wait_for(lambda: progress.matching_status.matching, "the subscription to arrive")  # type: ignore[attr-defined]  # the stub says bool
+        assert not marks.matching_status.matching  # type: ignore[attr-defined]  # the stub says bool

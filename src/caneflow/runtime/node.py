@@ -4,6 +4,7 @@ The launcher starts `python -m <program> <plan>`; the plan says what to read, wh
 """
 
 import logging
+import math
 import signal
 import sys
 import threading
@@ -63,7 +64,9 @@ MARKS_AHEAD = 0.1  # s, in a replay: that samples may be underway which a progre
 LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run
 REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
 SNAPSHOT_PERIOD = 0.5  # s between two snapshots of an operator
-QUICK = 0.002  # s: a node that takes longer for an event is not quick ...
+LIVE_SNAPSHOT_PERIOD = 2.0  # s, live: each is work, and wear of the disk; to catch up on so little is soon done
+QUICK = 0.002  # s of CPU: a node that takes longer for an event is not quick ...
+STALLED = 0.05  # s of the clock: nor is one that takes so long, waiting; less can be a machine with much else to do
 MOST_SLOW = (
     0.25  # ... and when so great a share of the last 64 or so was slow, Zenoh's threads do not wait for it any more
 )
@@ -194,7 +197,7 @@ class _ReaderNode(ABC):
         with self.lock:
             if not self._quick:  # it has ended meanwhile, or become slow
                 return False
-            began = time.monotonic()
+            began, worked = time.monotonic(), time.thread_time()
             try:
                 if type(event) is Arrived:  # as nearly all are
                     self.take_sample_at_once(event)
@@ -207,7 +210,9 @@ class _ReaderNode(ABC):
                 self._quick = False
                 self.bus.put(Broken(error))
             self._came = True
-            self._slow += ((time.monotonic() - began > QUICK) - self._slow) / 64
+            took = time.monotonic() - began
+            slow = took > STALLED or (took > QUICK and time.thread_time() - worked > QUICK)
+            self._slow += (slow - self._slow) / 64
             if self._slow > MOST_SLOW and not self.plan.replay:
                 self._quick = False
         return True
@@ -331,7 +336,8 @@ class _OperatorNode(_ReaderNode):
         self.keeper = SnapshotKeeper(snapshots, operator)
         self.marked: Progress | None = None  # what readers that wait were told last
         self.confirmed: dict[str, int] = {}  # by input key what the last snapshot has handled
-        self._next_snapshot = time.monotonic() + SNAPSHOT_PERIOD
+        self._snapshot_period = SNAPSHOT_PERIOD if plan.replay else LIVE_SNAPSHOT_PERIOD
+        self._next_snapshot = time.monotonic() + self._snapshot_period
         # Live: for each input that may lag, when the samples of the others came, and their stamps.
         self._others: dict[str, deque[tuple[float, int]]] = {
             port: deque() for port, wire in plan.inputs.items() if wire.max_lag_ms is not None and not plan.replay
@@ -351,6 +357,7 @@ class _OperatorNode(_ReaderNode):
                 self.ask_for_missing()
                 self.wait_no_longer_than_allowed()
                 self.report()
+            self.keep_snapshot()
         self.take_no_more()
         self.count(self.sent(), at_once=True)
 
@@ -439,13 +446,17 @@ class _OperatorNode(_ReaderNode):
 
     def keep_snapshot(self) -> None:
         """Now and then: what a new process in this one's place needs to go on."""
-        if time.monotonic() < self._next_snapshot:
-            return
-        self._next_snapshot = time.monotonic() + SNAPSHOT_PERIOD
-        handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
-        if handled != self.confirmed:
-            self.keeper.keep(self.stage.state(), self.history.kept())
-            self.confirmed = handled
+        with self.lock:
+            if time.monotonic() < self._next_snapshot:
+                return
+            self._next_snapshot = math.inf  # until this one is kept
+            handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
+            fresh = handled != self.confirmed
+            snapshot = self.keeper.taken(self.stage.state(), self.history.kept()) if fresh else None
+        if snapshot is not None:
+            self.keeper.keep(snapshot)  # live without the lock: samples do not wait for the disk
+        self.confirmed = handled
+        self._next_snapshot = time.monotonic() + self._snapshot_period
 
     def resume(self) -> bool:
         """Go on where a process before this one was killed; whether there was one."""
@@ -480,7 +491,6 @@ class _OperatorNode(_ReaderNode):
     def report(self) -> None:
         for note in self.stage.left_out():
             self.bus.send_left_out(note)
-        self.keep_snapshot()
         if self.stage.finished or self.stage.tells_more_than_samples() or self.reports.due():
             progress = self.progress()
             if self.stage.finished:

@@ -262,7 +262,8 @@ class Bus:
             subscribe(wire.key, self._on_sample(port))
             by_writer.setdefault(wire.writer, {})[wire.key.rpartition("/")[2]] = port
         for writer, ports in by_writer.items():
-            for word in ("progress",) if plan.replay else ("progress", "marks"):
+            # Whoever has no readers keeps nobody waiting.
+            for word in ("progress",) if plan.replay or not plan.outputs else ("progress", "marks"):
                 self._subscribe(control_key(plan.flow, word, writer), self._on_progress(ports))
             # That a writer's question arrives here shows that this side's subscriptions arrived there.
             key = control_key(plan.flow, "edge", writer, plan.node)

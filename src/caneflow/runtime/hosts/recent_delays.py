@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Sequence
 
 from caneflow.messages.control import Delays
 
@@ -29,17 +29,18 @@ class RecentDelays:
 
     def spread(self, now: int) -> Delays:
         """Medians and 99th percentiles, in s, and the silence up to `now` (ns)."""
+        latencies, ages = sorted(self._latencies), sorted(self._ages)
         return Delays(
-            latency_p50=percentile(self._latencies, 0.5),
-            latency_p99=percentile(self._latencies, 0.99),
-            age_p50=percentile(self._ages, 0.5),
-            age_p99=percentile(self._ages, 0.99),
+            latency_p50=percentile(latencies, 0.5),
+            latency_p99=percentile(latencies, 0.99),
+            age_p50=percentile(ages, 0.5),
+            age_p99=percentile(ages, 0.99),
             silent=None if self._last is None else (now - self._last) / 1e9,
         )
 
 
-def percentile(delays: Collection[int], part: float) -> float | None:
-    """The smallest of `delays` (ns) that at least `part` of them do not exceed, in s; None of none."""
+def percentile(delays: Sequence[int], part: float) -> float | None:
+    """The smallest of `delays` (ns, sorted) that at least `part` of them do not exceed, in s; None of none."""
     if not delays:
         return None
-    return sorted(delays)[max(0, math.ceil(part * len(delays)) - 1)] / 1e9
+    return delays[max(0, math.ceil(part * len(delays)) - 1)] / 1e9

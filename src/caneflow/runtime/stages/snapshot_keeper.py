@@ -35,19 +35,22 @@ class SnapshotKeeper:
         self._program = f"{self._name()}:{type(operator).__qualname__}"
         self._possible = True
 
-    def keep(self, stage: StageState, history: dict[str, list[Kept]]) -> None:
-        """Keep the operator's state and where its streams stand; the file is whole at any moment."""
+    def taken(self, stage: StageState, history: dict[str, list[Kept]]) -> bytes | None:
+        """The operator's state and where its streams stand; None, said once, when the state cannot be kept."""
         if not self._possible:
-            return
+            return None
         try:
             state = pack(vars(self._operator), self._module)
         except SnapshotError as error:
             self._possible = False
             log.warning("cannot be brought back exactly after a kill: %s", error)
-            return
-        snapshot = Snapshot(caneflow.__version__, self._program, stage, history, state)
+            return None
+        return msgspec.msgpack.encode(Snapshot(caneflow.__version__, self._program, stage, history, state))
+
+    def keep(self, snapshot: bytes) -> None:
+        """Write what was taken in place of the one before; the file is whole at any moment."""
         fresh = self._path.with_suffix(".new")
-        fresh.write_bytes(msgspec.msgpack.encode(snapshot))
+        fresh.write_bytes(snapshot)
         fresh.replace(self._path)
 
     def resume(self) -> Snapshot | None:
