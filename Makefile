@@ -4,6 +4,7 @@ VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 WALK := build/walk.mcap
+REPEATS ?= 3
 
 # Flows are started by the hundred: each process would compile every module anew where this is set.
 unexport PYTHONDONTWRITEBYTECODE
@@ -54,13 +55,13 @@ mcu-test: $(BIN)/.installed
 	$(BIN)/pytest tests/test_luenberger_fixed.py tests/test_uart_frames.py tests/test_uart_gateway.py tests/test_mcu.py
 
 # On a machine that does nothing else: what a sample costs part by part, a hop beside raw Zenoh and dora, how that grows,
-# and the pipeline as a whole.
+# and the pipeline as a whole. `make bench REPEATS=1` takes about half an hour, 3 about an hour and a quarter.
 bench: $(BIN)/.installed $(WALK)
-	$(BIN)/pytest --benchmark-enable --benchmark-only
 	$(BIN)/pip install --quiet --editable '.[peers]'
-	$(BIN)/python -m benchmarks.peers --write docs/performance_peers.md
-	$(BIN)/python -m benchmarks.scaling --write docs/performance_scaling.md
-	$(BIN)/python -m benchmarks.pipeline $(WALK) --write docs/performance_pipeline.md
+	$(BIN)/pytest --benchmark-enable --benchmark-only
+	$(BIN)/python -m benchmarks.scaling --repeats $(REPEATS) --write docs/performance_scaling.md
+	$(BIN)/python -m benchmarks.pipeline $(WALK) --repeats $(REPEATS) --write docs/performance_pipeline.md
+	$(BIN)/python -m benchmarks.peers --repeats $(REPEATS) --write docs/performance_peers.md  # last: fails when slower
 
 clean:
 	rm -rf $(VENV) build

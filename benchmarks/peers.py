@@ -3,7 +3,7 @@
 source -> relay -> sink, three processes; the relay decodes, numbers and encodes. Ratios to raw Zenoh come first: a
 machine is as fast as it happens to be, contenders in one run meet the same machine. Run it alone.
 
-    python -m benchmarks.peers --write docs/performance_peers.md   # all; about 15 minutes
+    python -m benchmarks.peers --write docs/performance_peers.md   # all; about 7 minutes a repeat
     python -m benchmarks.peers --part hop --repeats 1
 """
 
@@ -59,7 +59,7 @@ def main() -> None:
     """Measure all contenders in turn, again and again, and show medians with their spread."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--part", choices=list(PARTS), help="one part only")
-    parser.add_argument("--repeats", type=int, default=5, help="runs of each contender (default: 5)")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each contender (default: 3)")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the tables there, and all figures beside it")
     options = parser.parse_args()
     contenders = [name for name in CONTENDERS if name != "dora" or DORA.exists()]

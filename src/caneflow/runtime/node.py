@@ -54,7 +54,7 @@ from caneflow.runtime.stages.tap import Tap
 log = logging.getLogger(__name__)
 
 REPORT_PERIOD = 0.02  # s between two progress marks under load
-LIVE_REPORT_PERIOD = 0.2  # s, in a live run: who waits for a mark gets it at once
+LIVE_REPORT_PERIOD = 0.5  # s, in a live run: who waits for a mark gets it at once
 LIVE_LOOK_PERIOD = 0.1  # s after which a live node looks at what is due by time, though nothing came
 LOOKS_PER_LAG = 5  # and so often within the time that it may wait for an input
 COUNTERS_PERIOD = 1.0  # s
@@ -197,25 +197,31 @@ class _ReaderNode(ABC):
         with self.lock:
             if not self._quick:  # it has ended meanwhile, or become slow
                 return False
-            began, worked = time.monotonic(), time.thread_time()
             try:
-                if type(event) is Arrived:  # as nearly all are
+                if not self.plan.replay:
+                    self.take_and_time(event)
+                elif isinstance(event, Arrived):
                     self.take_sample_at_once(event)
-                    if self.plan.replay:
-                        self.between_samples()
-                else:
-                    self.take(event)
-                    self.follow_up(event)
+                    self.between_samples()
             except BaseException as error:
                 self._quick = False
                 self.bus.put(Broken(error))
             self._came = True
-            took = time.monotonic() - began
-            slow = took > STALLED or (took > QUICK and time.thread_time() - worked > QUICK)
-            self._slow += (slow - self._slow) / 64
-            if self._slow > MOST_SLOW and not self.plan.replay:
-                self._quick = False
         return True
+
+    def take_and_time(self, event: Event) -> None:
+        """Take an event and do what follows; judge by the time whether this node is quick."""
+        began, worked = time.monotonic(), time.thread_time()
+        if type(event) is Arrived:  # as nearly all are
+            self.take_sample_at_once(event)
+        else:
+            self.take(event)
+            self.follow_up(event)
+        took = time.monotonic() - began
+        slow = took > STALLED or (took > QUICK and time.thread_time() - worked > QUICK)
+        self._slow += (slow - self._slow) / 64
+        if self._slow > MOST_SLOW:
+            self._quick = False
 
     def take_sample_at_once(self, arrived: Arrived) -> None:
         """Take a sample and do what follows."""

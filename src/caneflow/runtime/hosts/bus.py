@@ -29,7 +29,7 @@ C = TypeVar("C", bound=msgspec.Struct)
 AGAIN = "caneflow.Again/1"
 ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
-TIMED_PERIOD = 0.013  # s between two in a live run; odd as well
+TIMED_PERIOD = 0.047  # s between two in a live run; odd as well
 ENCODINGS_KEPT = 8
 QUEUE = 1_000_000  # samples of a stream that may wait in a replay: more than its window lets come
 HEARING_OUT = 1.0  # s, at most, for what has come when a node is to end
