@@ -59,7 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("walk", type=Path)
     parser.add_argument("--repeats", type=int, default=3, help="runs of each (default: 3)")
-    parser.add_argument("--canes", type=int, nargs="+", default=[1, 4, 6, 8], help="how many at once (default: 1 4 6 8)")
+    parser.add_argument("--canes", type=int, nargs="+", default=[1, 4, 6, 8], help="at once (default: 1 4 6 8)")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the tables there, and all figures beside it")
     options = parser.parse_args()
     walk, repeats = options.walk.resolve(), range(options.repeats)
