@@ -31,6 +31,7 @@ from caneflow.runtime.hosts.attach import (
     timed_statuses,
 )
 from caneflow.runtime.hosts.links import open_session
+from caneflow.runtime.hosts.observations import OLD, OTHER_CLOCK
 from caneflow.runtime.wording import listed, one_line
 
 DIAL_TIMEOUT = 2.0  # s that a port may take to accept
@@ -300,6 +301,14 @@ def _edge(
             yield Finding(
                 node=where, state="look", text=f"{lost} samples lost ({place}): they {what}", attempts=attempts
             )
+    age = edge.delays.age_p50
+    if age is not None and OLD < age < OTHER_CLOCK:
+        text = f"samples are {age:.1f} s old in the median when they are taken, and so is what follows from them"
+        attempts = (
+            "which node is busy? `caneflow top`; is the link fast enough?",
+            "max_age_ms on this input drops and counts what is too old",
+        )
+        yield Finding(node=where, state="bad", text=text, attempts=attempts)
     writer, _, port = edge.writer.partition("/")
     reader = nodes[edge.reader.partition(".")[0]]
     sent = writers.get((writer, port), 0)

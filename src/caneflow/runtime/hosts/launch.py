@@ -373,6 +373,9 @@ class Launcher:
         node = self._nodes.get(message.node)
         if node is None:
             return
+        if isinstance(message, Counters) and node.here:
+            for line in self._observed.grown_old(message):
+                self._report(message.node, line)
         if isinstance(message, Progress):
             # A restarted reader begins anew: what it had handled before stands.
             node.handled = max(node.handled, message.handled)

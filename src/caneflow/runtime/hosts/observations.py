@@ -3,7 +3,7 @@
 import os
 import platform
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,6 +16,9 @@ from caneflow.runtime.plan import NodePlan
 
 LOOK_PERIOD = 1.0  # s between two looks at what the processes cost
 RATE_SPAN = 0.5  # s that two counts must at least lie apart for a rate between them
+OLD = 1.0  # s of age at which a sample is taken: a position that is made of it looks right, and is not
+TOO_SLOW = "this machine or the link is too slow (`caneflow top`), and positions are of then"
+OTHER_CLOCK = 3600.0  # s of age above which stamps are taken for those of another clock
 
 
 class ObservedNode(Protocol):
@@ -79,6 +82,20 @@ class Observations:
         self._counted: dict[str, _Counted] = {}
         self._costs: dict[int, _Cost] = {}  # by pid
         self._next_look = 0.0
+        self._old: set[tuple[str, str]] = set()  # node and input whose samples are too old, as was said
+
+    def grown_old(self, counters: Counters) -> Iterator[str]:
+        """A line for each input of a live node whose samples have become too old, and one when they no longer are."""
+        for port, delays in counters.delays.items():
+            age, wire = delays.age_p50, (counters.node, port)
+            if age is None or age > OTHER_CLOCK:
+                continue
+            if age > OLD and wire not in self._old:
+                self._old.add(wire)
+                yield f"{port}: samples are {age:.1f} s old in the median when they are taken: {TOO_SLOW}"
+            elif age < OLD / 2 and wire in self._old:
+                self._old.remove(wire)
+                yield f"{port}: samples are {age:.1f} s old, as they should be"
 
     def note(self, counters: Counters) -> None:
         """Take what a node says that it counted."""
