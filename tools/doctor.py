@@ -12,6 +12,7 @@ import typer
 from caneflow.errors import CaneflowError
 from caneflow.examinations import bno055, doppler_adc, mpu9250, p440
 from caneflow.examinations.samples import examine_samples
+from caneflow.options import At, Keys
 from caneflow.runtime import Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.dataflow.loading import load
@@ -38,12 +39,8 @@ def command(
     devices: Annotated[
         bool, typer.Option("--devices", help="Look at the devices; the flow must not be running.")
     ] = False,
-    at: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Where the flow runs, if not here: tcp/gateway.local:7447.")
-    ] = None,
-    keys: Annotated[
-        Path, typer.Option(metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
-    ] = DEFAULT_KEYS,
+    at: At = None,
+    keys: Keys = DEFAULT_KEYS,
     machine: Annotated[str | None, typer.Option(metavar="NAME", help="Only those at this machine.")] = None,
     seconds: Annotated[float, typer.Option(min=0.5, help="s of samples to judge a device by.")] = 3.0,
     settings: Annotated[

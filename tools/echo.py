@@ -5,7 +5,6 @@ import math
 import queue
 import sys
 import time
-from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -14,6 +13,7 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, MessageError, Sample, decode
+from caneflow.options import At, Keys
 from caneflow.runtime.hosts.attach import ANY, DEFAULT_KEYS, Heard, attached, parted
 
 MOST_WAITING = 10_000  # samples that may wait to be printed
@@ -25,12 +25,8 @@ def command(
         list[str] | None,
         typer.Argument(metavar="FLOW|NODE/PORT", help="The flow, and which streams of it; by default all."),
     ] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Where it runs, if not here, e.g. tcp/gateway.local:7447.")
-    ] = None,
-    keys: Annotated[
-        Path, typer.Option(metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
-    ] = DEFAULT_KEYS,
+    at: At = None,
+    keys: Keys = DEFAULT_KEYS,
     count: Annotated[int | None, typer.Option(min=1, help="Samples to print; by default until Ctrl-C.")] = None,
     seconds: Annotated[float | None, typer.Option(metavar="S", min=0.1, help="s to listen at most.")] = None,
     as_json: Annotated[

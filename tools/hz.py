@@ -9,13 +9,13 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import MessageError, Sample, decode
+from caneflow.options import At, Keys
 from caneflow.runtime.hosts.attach import ANY, DEFAULT_KEYS, Attached, Heard, attached, parted
 from caneflow.runtime.wording import in_columns
 
@@ -69,12 +69,8 @@ def command(
         list[str] | None,
         typer.Argument(metavar="FLOW|NODE/PORT", help="The flow, and which streams of it; by default all."),
     ] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Where it runs, if not here, e.g. tcp/gateway.local:7447.")
-    ] = None,
-    keys: Annotated[
-        Path, typer.Option(metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
-    ] = DEFAULT_KEYS,
+    at: At = None,
+    keys: Keys = DEFAULT_KEYS,
     seconds: Annotated[
         float | None,
         typer.Option(metavar="S", min=0.1, help="s to listen; by default 2, and in a terminal until Ctrl-C."),

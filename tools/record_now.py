@@ -1,13 +1,13 @@
 """`caneflow record --now`: the last seconds of a running flow, which its recorder holds in memory, into a file."""
 
 import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import typer
 
 from caneflow.errors import CaneflowError
+from caneflow.options import At, Keys
 from caneflow.runtime.hosts.attach import DEFAULT_KEYS, attached
 
 WRITE_NOW = b"write now"  # what the recorder understands
@@ -18,12 +18,8 @@ def command(
         str | None, typer.Argument(metavar="FLOW", help="Its name; by default the only one that runs here.")
     ] = None,
     now: Annotated[bool, typer.Option("--now", help="Write what is in memory to a file, now.")] = False,
-    at: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Where it runs, if not here, e.g. tcp/gateway.local:7447.")
-    ] = None,
-    keys: Annotated[
-        Path, typer.Option(metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
-    ] = DEFAULT_KEYS,
+    at: At = None,
+    keys: Keys = DEFAULT_KEYS,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list; spans in s.")] = False,
 ) -> None:
     """Have a flow that was started with `--record OUT --record-last 30s` write its last 30 s to a file of its own.

@@ -4,12 +4,12 @@ import json
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from caneflow.messages.control import FlowStatus, NodeStatus
+from caneflow.options import At, Keys
 from caneflow.runtime.hosts.attach import DEFAULT_KEYS, attached
 from caneflow.runtime.wording import in_columns
 
@@ -18,12 +18,8 @@ def command(
     flow: Annotated[
         str | None, typer.Argument(metavar="FLOW", help="Its name; by default the only one that runs here.")
     ] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Where it runs, if not here, e.g. tcp/gateway.local:7447.")
-    ] = None,
-    keys: Annotated[
-        Path, typer.Option(metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
-    ] = DEFAULT_KEYS,
+    at: At = None,
+    keys: Keys = DEFAULT_KEYS,
     every: Annotated[float, typer.Option(metavar="S", min=0.1, help="s between two looks.")] = 1.0,
     count: Annotated[
         int | None,

@@ -23,9 +23,10 @@ from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.control import FlowStatus
 from caneflow.messages.rig import Rig, read_rig
+from caneflow.options import At, Keys
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attach import ANY, Attached, Heard, attached
+from caneflow.runtime.hosts.attach import ANY, DEFAULT_KEYS, Attached, Heard, attached
 from caneflow.runtime.hosts.run_directory import running_flows
 from caneflow.runtime.node import run
 from caneflow.viewing.live import LiveStreams
@@ -46,9 +47,8 @@ def command(
     what: Annotated[
         str | None, typer.Argument(metavar="[FLOW|REC]", help="A running flow's name, or a recording.")
     ] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Where it runs, if not here, e.g. tcp/gateway.local:7447.")
-    ] = None,
+    at: At = None,
+    keys: Keys = DEFAULT_KEYS,
     port: Annotated[int, typer.Option(min=0, max=65535, help="On 127.0.0.1; 0: any that is free.")] = 0,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the page in the browser of this machine.")] = False,
 ) -> None:
@@ -64,7 +64,7 @@ def command(
         if what is not None and (Path(what).is_file() or Path(what).suffix == ".mcap"):
             _show_recording(Path(what), port, open_browser=open_browser)
         else:
-            _show_flow(what, at, port, open_browser=open_browser)
+            _show_flow(what, at, keys, port, open_browser=open_browser)
 
 
 def _show_recording(path: Path, port: int, *, open_browser: bool) -> None:
@@ -77,9 +77,9 @@ def _show_recording(path: Path, port: int, *, open_browser: bool) -> None:
             time.sleep(1.0)
 
 
-def _show_flow(flow: str | None, at: str | None, port: int, *, open_browser: bool) -> None:
+def _show_flow(flow: str | None, at: str | None, keys: Path, port: int, *, open_browser: bool) -> None:
     """Show a flow, and when it has ended and is started again, the new one."""
-    with attached(flow, at) as here:
+    with attached(flow, at, keys) as here:
         name, status = here.flow, here.status()
         streams = _streams(status)
         with serving(streams, port) as server:
@@ -87,19 +87,19 @@ def _show_flow(flow: str | None, at: str | None, port: int, *, open_browser: boo
             _relay(here, status, streams, local=at is None)
             while True:
                 print(f"{name} has ended; this goes on when it is started again (Ctrl-C ends it)", flush=True)
-                with _again(name, at) as (here, status):
+                with _again(name, at, keys) as (here, status):
                     streams = _streams(status)
                     server.show(streams)
                     _relay(here, status, streams, local=at is None)
 
 
 @contextmanager
-def _again(flow: str, at: str | None) -> Iterator[tuple[Attached, FlowStatus]]:
+def _again(flow: str, at: str | None, keys: Path) -> Iterator[tuple[Attached, FlowStatus]]:
     """Join the flow as soon as there is one of that name again."""
     with contextlib.ExitStack() as stack:
         while True:
             with contextlib.suppress(DataflowError):
-                here = stack.enter_context(attached(flow, at))
+                here = stack.enter_context(attached(flow, at, keys))
                 status = here.status()
                 break
             stack.pop_all().close()
