@@ -256,19 +256,19 @@ def test_losses_are_told_by_place_with_what_to_try(endpoint: str) -> None:
 
 
 def test_samples_that_come_late_though_none_is_lost_are_bad(endpoint: str) -> None:
-    old = msgspec.structs.replace(EDGE, delays=Delays(age_p50=3.2, age_p99=4.0))
+    old = msgspec.structs.replace(EDGE, delays=Delays(handled=3.2))
     (bad,) = (
         finding
         for finding in findings_of(endpoint, msgspec.structs.replace(STATUS, edges=[old]))
         if finding.state != "ok"
     )
     assert (bad.node, bad.state) == ("imu/imu > fusion.imu", "bad")
-    assert bad.text.startswith("samples are 3.2 s old in the median")
+    assert bad.text.startswith("samples are 3.2 s old when they are handled")
 
 
 @pytest.mark.parametrize("age", [0.9, 1.7e9])
 def test_samples_of_now_or_of_another_clock_are_not(endpoint: str, age: float) -> None:
-    well = msgspec.structs.replace(EDGE, delays=Delays(age_p50=age, age_p99=age))
+    well = msgspec.structs.replace(EDGE, delays=Delays(handled=age))
     assert {each.state for each in findings_of(endpoint, msgspec.structs.replace(STATUS, edges=[well]))} == {"ok"}
 
 

@@ -7,7 +7,7 @@ from caneflow.runtime.hosts.observations import OLD, OTHER_CLOCK, Observations
 
 
 def told(age: float | None) -> Counters:
-    return Counters(node="fusion", inputs={}, outputs={}, delays={"imu": Delays(age_p50=age)})
+    return Counters(node="fusion", inputs={}, outputs={}, delays={"imu": Delays(handled=age)})
 
 
 def test_samples_that_have_become_old_are_said_once_and_when_they_no_longer_are() -> None:
@@ -15,7 +15,7 @@ def test_samples_that_have_become_old_are_said_once_and_when_they_no_longer_are(
     ages = [0.01, 0.9 * OLD, 3.2, 9.0, 0.9 * OLD, 0.01, 0.01, 2.0]
     lines = [list(observed.grown_old(told(age))) for age in ages]
     assert [len(each) for each in lines] == [0, 0, 1, 0, 0, 1, 0, 1]
-    assert lines[2][0].startswith("imu: samples are 3.2 s old in the median when they are taken")
+    assert lines[2][0].startswith("imu: samples are 3.2 s old when they are handled")
     assert lines[5] == ["imu: samples are 0.0 s old, as they should be"]
 
 

@@ -43,3 +43,8 @@ def test_old_delays_are_forgotten() -> None:
     for _ in range(KEPT):
         delays.note(now=2, sent_at=1, stamp=0)
     assert delays.spread(2).latency_p99 == 1e-9
+
+
+def test_the_age_at_which_a_sample_was_handled_is_told_live_only() -> None:
+    assert RecentDelays(live=True).spread(now=5, handled=2.5).handled == 2.5
+    assert RecentDelays(live=False).spread(now=5, handled=2.5).handled is None

@@ -69,6 +69,7 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     latency_p99: float | None = None
     age_p50: float | None = None  # live: from the measurement (its stamp) to the reader's hand
     age_p99: float | None = None
+    handled: float | None = None  # live: from the measurement of the last one that was handled, to then
     silent: float | None = None  # since the last one came
 
 

@@ -326,7 +326,8 @@ class _ReaderNode(ABC):
         if not (at_once or self.reports.counters_due()):
             return
         now = time.time_ns()
-        delays = {port: each.spread(now) for port, each in self._delays.items()}
+        inputs = self.reader.inputs
+        delays = {port: each.spread(now, inputs[port].handled_age) for port, each in self._delays.items()}
         counts = self.reader.input_counts()
         counters = Counters(
             node=self.plan.node, inputs=counts, outputs=outputs, delays=delays, ended=self.reader.finished
@@ -356,15 +357,17 @@ class _OperatorNode(_ReaderNode):
         if resumed:
             with self.lock:
                 self.send_again()
+        more = False
         while not self.stopped:
-            self.take_events(timeout=self.look_period)
+            self.take_events(timeout=0 if more else self.look_period)
             with self.lock:
-                self.handle_what_is_due()
+                more = self.handle_what_is_due()
                 self.ask_for_missing()
                 self.wait_no_longer_than_allowed()
                 self.report()
             self.keep_snapshot()
         self.take_no_more()
+        self.tell_left_out()
         self.count(self.sent(), at_once=True)
 
     def take_sample_at_once(self, arrived: Arrived) -> None:
@@ -423,13 +426,17 @@ class _OperatorNode(_ReaderNode):
     def skip_to(self, port: str, seq: int) -> None:
         self.stage.skip_to(port, seq)
 
-    def handle_what_is_due(self) -> None:
-        now = self.now()
-        while (emitted := self.stage.step(now)) is not None:
+    def handle_what_is_due(self) -> bool:
+        """Handle samples until none is due, or for so long that all else would wait; whether more may be due."""
+        until = time.monotonic() + self.look_period
+        while (emitted := self.stage.step(self.now())) is not None:
             self.send(emitted)
             self.report_if_due()
             if self.bus.pending():
                 self.take_events(timeout=0)
+            if time.monotonic() > until:
+                return True
+        return False
 
     def now(self) -> int | None:
         """The clock (ns) by which samples may be too old; a replay has none."""
@@ -494,9 +501,12 @@ class _OperatorNode(_ReaderNode):
                 self.stage.go_on_without(port, until)
                 self.handle_what_is_due()
 
-    def report(self) -> None:
+    def tell_left_out(self) -> None:
         for note in self.stage.left_out():
             self.bus.send_left_out(note)
+
+    def report(self) -> None:
+        self.tell_left_out()
         if self.stage.finished or self.stage.tells_more_than_samples() or self.reports.due():
             progress = self.progress()
             if self.stage.finished:

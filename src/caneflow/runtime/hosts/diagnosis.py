@@ -301,9 +301,9 @@ def _edge(
             yield Finding(
                 node=where, state="look", text=f"{lost} samples lost ({place}): they {what}", attempts=attempts
             )
-    age = edge.delays.age_p50
+    age = edge.delays.handled
     if age is not None and OLD < age < OTHER_CLOCK:
-        text = f"samples are {age:.1f} s old in the median when they are taken, and so is what follows from them"
+        text = f"samples are {age:.1f} s old when they are handled, and so is what follows from them"
         attempts = (
             "which node is busy? `caneflow top`; is the link fast enough?",
             "max_age_ms on this input drops and counts what is too old",

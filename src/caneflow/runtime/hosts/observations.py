@@ -87,12 +87,12 @@ class Observations:
     def grown_old(self, counters: Counters) -> Iterator[str]:
         """A line for each input of a live node whose samples have become too old, and one when they no longer are."""
         for port, delays in counters.delays.items():
-            age, wire = delays.age_p50, (counters.node, port)
+            age, wire = delays.handled, (counters.node, port)
             if age is None or age > OTHER_CLOCK:
                 continue
             if age > OLD and wire not in self._old:
                 self._old.add(wire)
-                yield f"{port}: samples are {age:.1f} s old in the median when they are taken: {TOO_SLOW}"
+                yield f"{port}: samples are {age:.1f} s old when they are handled: {TOO_SLOW}"
             elif age < OLD / 2 and wire in self._old:
                 self._old.remove(wire)
                 yield f"{port}: samples are {age:.1f} s old, as they should be"

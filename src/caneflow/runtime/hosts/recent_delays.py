@@ -27,14 +27,15 @@ class RecentDelays:
         if self._live:
             self._ages.append(now - stamp)
 
-    def spread(self, now: int) -> Delays:
-        """Medians and 99th percentiles, in s, and the silence up to `now` (ns)."""
+    def spread(self, now: int, handled: float | None = None) -> Delays:
+        """Medians and 99th percentiles, in s, and the silence up to `now` (ns); `handled`: its last age (s)."""
         latencies, ages = sorted(self._latencies), sorted(self._ages)
         return Delays(
             latency_p50=percentile(latencies, 0.5),
             latency_p99=percentile(latencies, 0.99),
             age_p50=percentile(ages, 0.5),
             age_p99=percentile(ages, 0.99),
+            handled=handled if self._live else None,
             silent=None if self._last is None else (now - self._last) / 1e9,
         )
 

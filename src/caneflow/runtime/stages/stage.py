@@ -165,7 +165,7 @@ class Stage:
     def _handled(
         self, port: str, arrivals: Arrivals, message: Sample, now: int | None
     ) -> list[tuple[str, Sample, int]]:
-        arrivals.note_handled(message)
+        arrivals.note_handled(message, now)
         if now is not None and arrivals.too_old(message, now):
             arrivals.counts.dropped += 1
             arrivals.leave_out(message, "dropped")

@@ -36,6 +36,7 @@ class Arrivals:
     ahead: dict[int, Sample] = field(default_factory=dict)  # those that wait, by seq
     handled_seq: int = -1  # of the last sample that needs no asking for
     handled_stamp: int = BEGIN  # ns, likewise
+    handled_at: int | None = None  # ns, the host's clock, when the sample of that stamp was; a live host only
     mark: PortMark | None = None  # of the writer, waiting for its last sample to arrive
     _named: set[str] = field(default_factory=set)
     _silences: int = 0  # that were said
@@ -129,10 +130,17 @@ class Arrivals:
             found.append(self._next(message))
         return found
 
-    def note_handled(self, message: Sample) -> None:
-        """Note that `message` needs no asking for any more."""
+    def note_handled(self, message: Sample, now: int | None = None) -> None:
+        """Note that `message` needs no asking for any more; `now` (ns): it is in the program's hands, live."""
         if message.seq > self.handled_seq:
-            self.handled_seq, self.handled_stamp = message.seq, message.stamp
+            self.handled_seq, self.handled_stamp, self.handled_at = message.seq, message.stamp, now
+
+    @property
+    def handled_age(self) -> float | None:
+        """How old (s) the last sample was when it was handled; None where that is not known."""
+        if self.handled_at is None or self.clock_offset is None:
+            return None
+        return (self.handled_at + self.clock_offset - self.handled_stamp) / 1e9
 
     def too_old(self, message: Sample, now: int) -> bool:
         """Whether `message` is older than the graph wants it."""

@@ -95,7 +95,7 @@ class Tap:
 
     def _hand_on(self, port: str, arrivals: Arrivals, message: Sample, payload: bytes, time: int) -> None:
         arrivals.counts.handled += 1
-        arrivals.note_handled(message)
+        arrivals.note_handled(message, time)
         self._sink.take(arrivals.plan.key, message, payload, time)
         self._advance(port, message.stamp)
 
