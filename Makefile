@@ -55,7 +55,7 @@ mcu-test: $(BIN)/.installed
 	$(BIN)/pytest tests/test_luenberger_fixed.py tests/test_uart_frames.py tests/test_uart_gateway.py tests/test_mcu.py
 
 # On a machine that does nothing else: what a sample costs part by part, a hop beside raw Zenoh and dora, how that grows,
-# and the pipeline as a whole. `make bench REPEATS=1` takes about half an hour, 3 about an hour and a quarter.
+# and the pipeline as a whole. `make bench REPEATS=2` takes about half an hour.
 bench: $(BIN)/.installed $(WALK)
 	$(BIN)/pip install --quiet --editable '.[peers]'
 	$(BIN)/pytest --benchmark-enable --benchmark-only

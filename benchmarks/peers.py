@@ -3,7 +3,7 @@
 source -> relay -> sink, three processes; the relay decodes, numbers and encodes. Ratios to raw Zenoh come first: a
 machine is as fast as it happens to be, contenders in one run meet the same machine. Run it alone.
 
-    python -m benchmarks.peers --write docs/performance_peers.md   # all; about 7 minutes a repeat
+    python -m benchmarks.peers --write docs/performance_peers.md   # all; about 6 minutes a repeat
     python -m benchmarks.peers --part hop --repeats 1
 """
 

@@ -2,7 +2,7 @@
 
 Everything that is not a hop, in one run, with its spread. Run it alone, on a walk:
 
-    python -m benchmarks.pipeline walk.mcap --write docs/performance_pipeline.md   # about 8 minutes a repeat
+    python -m benchmarks.pipeline walk.mcap --write docs/performance_pipeline.md   # about 4 minutes a repeat
 """
 
 import argparse

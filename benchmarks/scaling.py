@@ -3,7 +3,7 @@
 One thing grows, all else is a chain of one relay with IMU samples at 100 Hz. Cost is the CPU time of all processes,
 launcher included, for a sample and a hop; latency goes from the source's stamp to the (last) sink. Run it alone.
 
-    python -m benchmarks.scaling --write docs/performance_scaling.md   # and .json, .png; about 8 minutes a repeat
+    python -m benchmarks.scaling --write docs/performance_scaling.md   # and .json, .png; about 4 minutes a repeat
 """
 
 import argparse
