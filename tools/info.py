@@ -64,6 +64,7 @@ def describe(path: Path, *, full: bool = False) -> dict[str, Any]:
             "size": path.stat().st_size,
             "complete": recording.complete,
             **{key: recording.metadata.get(key) for key in ("flow", "source", "run", "version", "part")},
+            "platform": str(recording.platform) if recording.platform else None,
             "start": span[0] if span else None,
             "duration": (span[1] - span[0]) / 1e9 if span else 0.0,
             "rig": recording.rig,
@@ -114,6 +115,8 @@ def _lines(about: dict[str, Any]) -> Iterator[str]:
     yield f"flow      {about['flow']}, {about['source']}, run {about['run']}"
     yield f"start     {_date(about['start'])}"
     yield f"duration  {about['duration']:.3f} s"
+    if about["platform"] is not None:
+        yield f"platform  {about['platform']}"
     if about["part"] is not None:
         yield f"part      {about['part']} of the run, as --rotate or --record-last made it"
     yield f"rig       {', '.join(about['rig']) or 'nothing known'}"

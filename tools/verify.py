@@ -8,15 +8,21 @@ from typing import Annotated
 import typer
 
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.replays.verification import Verdict, verify
+from caneflow.runtime.replays.verification import ACROSS_PLATFORMS, Verdict, verify
 
 
 def command(
     file: Annotated[Path, typer.Argument(help="The dataflow, e.g. dataflow.yaml.")],
     recording: Annotated[Path, typer.Argument(metavar="REC", help="A recording with the outputs of a run.")],
     tolerance: Annotated[
-        float, typer.Option(min=0, help="Largest difference of a number, in its own SI unit; 0: equal bytes.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            min=0,
+            help="Largest difference of a number, in its own SI unit; 0: equal bytes. "
+            f"Default: 0, or {ACROSS_PLATFORMS:g} for a recording from another platform.",
+            show_default=False,
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting.")
     ] = None,
@@ -24,7 +30,9 @@ def command(
 ) -> None:
     """Run a recording again, in this process, and compare each operator's output with the recorded one.
 
-    What a recorded live run did not handle in time is left out, as it was then. Exit status 0: every stream is as
+    What a recorded live run did not handle in time is left out, as it was then. A recording that was computed on
+    another platform (architecture, C library, numpy, scipy) is compared within a tolerance, after a line that names
+    the differences. Exit status 0: every stream is as
     it was recorded. 1: one is not; its first difference is named. 2: the file or the recording cannot be used.
 
     Example: caneflow verify dataflow.yaml field.mcap --tolerance 1e-9
@@ -32,8 +40,12 @@ def command(
     verification = verify(load(file, settings or ()), recording, tolerance=tolerance)
     if as_json:
         streams = {verdict.stream: _plain(verdict) for verdict in verification.verdicts}
-        print(json.dumps({"holds": verification.holds, "streams": streams}, indent=2))
+        about = {"holds": verification.holds, "tolerance": verification.tolerance}
+        print(json.dumps({**about, "platform_differences": verification.differences, "streams": streams}, indent=2))
     else:
+        if verification.differences:
+            print(f"another platform: {'; '.join(verification.differences)}")
+            print(f"numbers may differ by {verification.tolerance:g}, each in its own SI unit")
         for verdict in verification.verdicts:
             print(f"{verdict.stream}: {_said(verdict)}")
     raise typer.Exit(0 if verification.holds else 1)

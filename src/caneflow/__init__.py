@@ -1,6 +1,10 @@
 """caneflow: a handful of sensors become a position, as a graph of processes over Zenoh."""
 
+from caneflow import dispatch
+
 __version__: str
+
+dispatch.pin()  # before anything imports numpy
 
 
 def __getattr__(name: str) -> str:

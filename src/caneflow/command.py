@@ -1,6 +1,5 @@
 """The door of the `caneflow` command: finds the tool for a word, and turns an expected error into one line."""
 
-import os
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -12,6 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import caneflow
+from caneflow import dispatch
 from caneflow.errors import CaneflowError
 
 TOOLS = "caneflow.tools"
@@ -19,9 +19,6 @@ USAGE_STATUS = 2  # exit status of an expected error, as of a misspelt option
 # UsageError, which typer does not name: of click, or of its own copy of click.
 MISUSE = cast(type[Exception], typer.BadParameter.__mro__[1])
 INTERRUPTED_STATUS = 130  # 128 + SIGINT, as a shell reports Ctrl-C
-
-# One thread for linear algebra in each process: a flow is parallel already, and sums must not depend on cores.
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 # Word -> module in tools, one line of help. A tool has `command`, a function whose annotations are its options, or
 # `commands`, such functions by word. It is imported when its word is used: `caneflow check` needs no matplotlib.
@@ -77,10 +74,14 @@ class Door(TyperGroup):
         super().invoke(ctx)
 
 
+def program() -> NoReturn:
+    """The `caneflow` program: the command line in an interpreter whose numerical kernels are pinned."""
+    dispatch.restart_with_pinned_mathematics()
+    main()
+
+
 def main() -> NoReturn:
     """Run the command line's word; exit status 2 and one line for an expected error, a traceback for a bug."""
-    for variable in ONE_THREAD:  # before numpy is imported
-        os.environ.setdefault(variable, "1")
     try:
         status = _command().main(prog_name="caneflow", standalone_mode=False)
     except MISUSE as error:
@@ -184,4 +185,4 @@ def _typer(**settings: Any) -> typer.Typer:
 
 
 if __name__ == "__main__":
-    main()
+    program()

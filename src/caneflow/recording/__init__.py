@@ -1,6 +1,7 @@
 """What a flow said, kept in a file: MCAP in and out, as docs/recordings.md lays it out."""
 
 from caneflow.recording.errors import RecordingError
+from caneflow.recording.platform import Platform
 from caneflow.recording.reader import TRUTH, Recorded, Recording, Stream
 from caneflow.recording.recover import Recovered, recover
 from caneflow.recording.writer import Compression, Origin, RecordingWriter, require_writable
@@ -9,6 +10,7 @@ __all__ = [
     "TRUTH",
     "Compression",
     "Origin",
+    "Platform",
     "Recorded",
     "Recording",
     "RecordingError",

@@ -18,6 +18,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.recording.errors import RecordingError
 from caneflow.recording.layout import DAMAGE, MAGIC, Block, Content, Layout, content_of, layout_of
+from caneflow.recording.platform import Platform
 
 TRUTH = ("truth", "pose")  # node and port of the ground truth, where there is any
 MAX_RIG_DEPTH = 16
@@ -69,6 +70,7 @@ class Recording:
 
     complete: False for a file whose writer was killed (or still writes); everything up to the cut is there.
     metadata: flow, version, run, source.  rig: as it was recorded.
+    platform: on what it was computed; None when it does not say.
     streams: by (node, port), in the order in which they were recorded first.
     control: number of messages by key, of what the flow said about itself.
 
@@ -88,6 +90,7 @@ class Recording:
             self._lasts: dict[tuple[int, str], int] = {}  # by offset and key: the last stamp, ns
             self.complete = self._layout.complete
             self.metadata, self.rig = _about(self.path, self._layout)
+            self.platform = Platform.read(self.metadata)
             self.streams, self.control = self._streams()
         except BaseException:
             self._file.close()

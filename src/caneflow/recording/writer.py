@@ -15,6 +15,7 @@ from mcap.writer import CompressionType, Writer
 import caneflow
 from caneflow.messages import Sample, json_schema
 from caneflow.recording.errors import RecordingError
+from caneflow.recording.platform import Platform
 
 Compression: TypeAlias = Literal["zstd", "lz4", "none"]
 Origin: TypeAlias = Literal["live", "replayed", "simulated", "imported"]
@@ -52,6 +53,7 @@ class RecordingWriter:
         about = {"flow": flow, "version": FORMAT_VERSION, "run": run or uuid.uuid4().hex, "source": source}
         if part is not None:
             about["part"] = str(part)
+        about["platform"] = Platform.here().as_json()
         bolted_on = {"json": json.dumps(rig, allow_nan=False)}
         self.path = Path(path)
         self._channels: dict[str, tuple[int, str]] = {}  # by key: channel id, name of its schema
