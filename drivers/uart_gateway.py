@@ -114,7 +114,8 @@ class Microcontroller:
                     self.status = _status(frame)
                     if self.status.session == session:
                         return self.status
-        raise DataflowError(f"no microcontroller has answered for {self._settings.start_timeout_s:g} s")
+        silent = f"no microcontroller has answered for {self._settings.start_timeout_s:g} s"
+        raise DataflowError(silent) from TimeoutError(silent)  # it may be there when the node is started again
 
     def tell(self, payload: bytes) -> None:
         """Send a ground speed (msgpack)."""

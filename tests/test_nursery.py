@@ -16,13 +16,17 @@ from tests.flows import CANEFLOW, NODES, node_processes, spread_cane, wait_for, 
 # Starts a program from a nursery; prints its pid, all that it wrote, and how it ended.
 START = """
 import json, os, sys
+from caneflow.runtime.hosts import last_words
 from caneflow.runtime.hosts.nursery import Nursery
 nursery = Nursery()
 reading, writing = os.pipe()
 nursery.start(sys.argv[1:], writing)
 os.close(writing)
 started = nursery.hear()
-wrote = os.fdopen(reading).read()
+wrote = ""
+for line in os.fdopen(reading):  # as the launcher shows them
+    words = last_words.heard(line)
+    wrote += line if words is None else "\\n".join(words.lines) + "\\n"
 ended = nursery.hear()
 nursery.close()
 print(json.dumps([started.pid, wrote, ended.pid, ended.status]))

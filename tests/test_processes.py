@@ -310,8 +310,52 @@ def test_a_node_that_fails_for_good_ends_the_run(live: Path, tmp_path: Path) -> 
     )
     done = caneflow("run", live)
     assert done.returncode == 1
-    assert "RuntimeError: no more" in done.stderr
-    assert re.search(r"echo ended with status 1 after 1 restarts: .*RuntimeError: no more", done.stderr)
+    assert done.stderr.count("Traceback") == 1
+    last = done.stderr.splitlines()[-1]
+    assert re.fullmatch(r"caneflow run: echo ended with status 1 after 1 restarts: .*: RuntimeError: no more", last)
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        ("raise RuntimeError('a bug')", "RuntimeError: a bug"),
+        ("raise IndexError('a bug')", "IndexError: a bug"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+    ],
+)
+def test_in_a_replay_the_second_fault_at_one_sample_ends_the_run(
+    live: Path, tmp_path: Path, walk: Path, fault: str, error: str
+) -> None:
+    live.write_text(live.read_text().replace("ticker/imu", "imu/imu").replace("ticker", "imu"))
+    live.write_text(live.read_text().replace("./imu.py", "drivers.bno055"))
+    (tmp_path / "echo.py").write_text(ECHO.replace("yield", f"if message.seq == 250: {fault}\n        yield"))
+    done = caneflow("run", live, "--replay", walk, "--speed", "max")
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.count("Traceback") == (0 if "Exit" in fault else 1)
+    assert done.stderr.count("restart 1 of 10") == 1
+    assert "restart 2" not in done.stderr
+    why = r"given up, it was the second time at the same sample \(imu seq 250\)"
+    last = done.stderr.splitlines()[-1]
+    assert re.fullmatch(rf"caneflow run: echo ended with status \d after 1 restarts: {why}: {error}", last)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error"),
+    [
+        ("        pass", "        import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'"),
+        ("        pass", "        context.rig.required('pivot')", "AttributeError: .*"),
+        ('if __name__ == "__main__":', 'if __name__ == "__main__":\n    1 / 0', "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_a_restart_would_not_mend_is_not_tried_again(
+    live: Path, tmp_path: Path, old: str, new: str, error: str
+) -> None:
+    (tmp_path / "echo.py").write_text(ECHO.replace(old, new))
+    done = caneflow("run", live)
+    assert done.returncode == 1, done.stderr
+    assert (done.stderr.count("Traceback"), done.stderr.count("; restart ")) == (1, 0)
+    last = done.stderr.splitlines()[-1]
+    assert re.fullmatch(f"caneflow run: echo ended with status 1: a restart would not mend it: {error}", last)
 
 
 def test_a_node_that_hangs_before_it_is_ready_is_named(

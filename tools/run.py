@@ -116,7 +116,7 @@ def summary(deployment: Deployment, outcome: Outcome, took_s: float) -> None:
     """Print how the run ended: what each node gave, what was refused or lost, what failed."""
     for node, counters in outcome.counters.items():
         if text := _counted(counters):
-            print(f"{node}: {text}")
+            print(f"{node}: {text}", flush=True)  # before the failures, wherever both go
     for failure in outcome.failures:
         print(f"caneflow run: {failure}", file=sys.stderr)
     if not outcome.failures and not outcome.interrupted:

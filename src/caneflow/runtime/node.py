@@ -18,7 +18,6 @@ from pathlib import Path
 
 import msgspec
 
-from caneflow.errors import CaneflowError
 from caneflow.messages import MessageError, Sample, decode, numbered
 from caneflow.messages.control import Again, Clock, Counters, Progress
 from caneflow.messages.rig import read_rig
@@ -40,6 +39,7 @@ from caneflow.runtime.hosts.bus import (
     Timed,
     check_schema,
 )
+from caneflow.runtime.hosts.last_words import telling_failures
 from caneflow.runtime.hosts.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Operator, Program, Quiet, Sink, Source
@@ -75,16 +75,14 @@ MOST_SLOW = (
 def run(program: Program) -> None:
     """Run `program` as the node that the plan on the command line describes; the process ends with it."""
     logging.basicConfig(format="%(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
-    try:
+    if len(sys.argv) < 2:
+        sys.exit(f"usage: {sys.argv[0]} PLAN; a node is started by `caneflow run`")
+    with telling_failures():
         path = Path(sys.argv[1])
         plan = NodePlan.read(path)
         folder = path.parent if plan.state_folder is None else Path(plan.state_folder)
-        sys.exit(_run(program, plan, folder / f"{plan.node}.snapshot"))
-    except IndexError:
-        sys.exit(f"usage: {sys.argv[0]} PLAN; a node is started by `caneflow run`")
-    except CaneflowError as error:
-        log.error("%s", error)
-        sys.exit(2)
+        _run(program, plan, folder / f"{plan.node}.snapshot")
+    sys.exit(0)
 
 
 def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
@@ -96,19 +94,22 @@ def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
     return program(settings, Context(node=plan.node, rig=read_rig(plan.rig), ports=kinds, random=random))
 
 
-def _run(program: Program, plan: NodePlan, snapshots: Path) -> int:
-    built = build(program, plan)
+def _run(program: Program, plan: NodePlan, snapshots: Path) -> None:
+    with telling_failures(building=True):
+        built = build(program, plan)
     with Bus(plan) as bus:
         signal.signal(signal.SIGINT, lambda *_: None)  # the launcher decides when a node ends
+        node: _SourceNode | _SinkNode | _OperatorNode
         if isinstance(built, Source):
-            _SourceNode(plan, bus, built).run()
-            return 0
-        signal.signal(signal.SIGTERM, lambda *_: bus.put(Stopped()))
-        if isinstance(built, Sink):
-            _SinkNode(plan, bus, built).run()
+            node = _SourceNode(plan, bus, built)
         else:
-            _OperatorNode(plan, bus, built, snapshots).run()
-    return 0
+            signal.signal(signal.SIGTERM, lambda *_: bus.put(Stopped()))
+            if isinstance(built, Sink):
+                node = _SinkNode(plan, bus, built)
+            else:
+                node = _OperatorNode(plan, bus, built, snapshots)
+        with telling_failures(at=node.at):
+            node.run()
 
 
 class _Reports:
@@ -171,9 +172,26 @@ class _ReaderNode(ABC):
         lags = [1e-3 * wire.max_lag_ms / LOOKS_PER_LAG for wire in plan.inputs.values() if wire.max_lag_ms is not None]
         self.look_period = REPORT_PERIOD if plan.replay else max(min([LIVE_LOOK_PERIOD, *lags]), REPORT_PERIOD / 4)
         self._came = False  # anything, at once, since this was last looked at
+        self._broken: BaseException | None = None  # what was raised at once: the node handles and keeps nothing more
         for port, arrivals in reader.inputs.items():
             arrivals.patient = True
             arrivals.clock_offset = None if plan.inputs[port].clock else 0
+
+    def at(self) -> str | None:
+        """The sample that is being handled, or was last; None: the node has not begun."""
+        if not self.bus.ready:
+            return None
+        handled = [
+            (each.handled_at or 0, each.handled_stamp, order, f"{port} seq {each.handled_seq}")
+            for order, (port, each) in enumerate(self.reader.inputs.items())
+            if each.handled_seq >= 0
+        ]
+        return max(handled)[-1] if handled else "the first"
+
+    def raise_if_broken(self) -> None:
+        """Raise here what was raised on the thread that brought a sample; with the lock held."""
+        if self._broken is not None:
+            raise self._broken
 
     def take_events(self, timeout: float) -> bool:
         """Take what came, waiting up to `timeout` s for it; whether anything came."""
@@ -205,6 +223,7 @@ class _ReaderNode(ABC):
                     self.between_samples()
             except BaseException as error:
                 self._quick = False
+                self._broken = error
                 self.bus.put(Broken(error))
             self._came = True
         return True
@@ -361,6 +380,7 @@ class _OperatorNode(_ReaderNode):
         while not self.stopped:
             self.take_events(timeout=0 if more else self.look_period)
             with self.lock:
+                self.raise_if_broken()
                 more = self.handle_what_is_due()
                 self.ask_for_missing()
                 self.wait_no_longer_than_allowed()
@@ -460,7 +480,7 @@ class _OperatorNode(_ReaderNode):
     def keep_snapshot(self) -> None:
         """Now and then: what a new process in this one's place needs to go on."""
         with self.lock:
-            if time.monotonic() < self._next_snapshot:
+            if self._broken is not None or time.monotonic() < self._next_snapshot:
                 return
             self._next_snapshot = math.inf  # until this one is kept
             handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
@@ -530,6 +550,7 @@ class _SinkNode(_ReaderNode):
             while not self.stopped:
                 came = self.take_events(timeout=self.look_period)
                 with self.lock:
+                    self.raise_if_broken()
                     self.go_on(came)
         finally:
             self.bus.hear_out()
@@ -586,6 +607,12 @@ class _SourceNode:
         self.started = False
         self.stopped = False
         self.until = BEGIN if plan.replay else END  # how far a replay may send
+
+    def at(self) -> str | None:
+        """The sample that was sent last; None: the node has not begun."""
+        if not self.bus.ready:
+            return None
+        return ", ".join(f"{port} seq {out.sent - 1}" for port, out in self.feed.outputs.items())
 
     def run(self) -> None:
         try:

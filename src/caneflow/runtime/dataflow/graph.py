@@ -38,9 +38,9 @@ class Restart:
     """What becomes of a node when its process ends."""
 
     policy: Literal["never", "on-failure", "always"]
-    max_restarts: int  # within the window; then the node has failed for good
-    window_s: float  # s
-    delay_s: float  # s before the first restart; doubles with each one in the window
+    max_restarts: int  # that count; then the node has failed for good
+    window_s: float  # s: a node that is up for so long has its earlier ends forgotten
+    delay_s: float  # s before the first restart; doubles with each one that counts
     max_delay_s: float  # s
 
 

@@ -66,11 +66,15 @@ class RestartShape(Shape):
         "on-failure"
     )
     max_restarts: Annotated[
-        int, Field(ge=1, le=1000, description="restarts within `window_s` until it is given up")
+        int,
+        Field(ge=1, le=1000, description="restarts until it is given up; each counts for as long as `window_s` says"),
     ] = 10
-    window_s: Annotated[float, Field(gt=0, le=86400, description="s")] = 60.0
+    window_s: Annotated[
+        float,
+        Field(gt=0, le=86400, description="s that the node has to be up until earlier ends of it no longer count"),
+    ] = 60.0
     delay_s: Annotated[
-        float, Field(ge=0, le=3600, description="s before the first restart; doubles with each one in the window")
+        float, Field(ge=0, le=3600, description="s before the first restart; doubles with each one that counts")
     ] = 0.25
     max_delay_s: Annotated[float, Field(gt=0, le=3600, description="s; the delay grows no further")] = 10.0
 

@@ -127,6 +127,7 @@ class Bus:
     """A node's session; a context manager, since a session that is not closed hangs its process."""
 
     def __init__(self, plan: NodePlan) -> None:
+        self.ready = False  # it hears, is heard, and has said so
         self._plan = plan
         self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
         # Takes an event on the thread that brought it; False: it did not, and the event goes into the inbox.
@@ -163,6 +164,7 @@ class Bus:
                 self._wait_for_reader(reader)
         key = control_key(self._plan.flow, "ready", self._plan.node)
         self._held.append(self._session.liveliness().declare_token(key))
+        self.ready = True
 
     def hear_out(self) -> None:
         """End the threads that samples come on, once they have brought what has come."""

@@ -22,7 +22,9 @@ from caneflow.runtime.deployment import (
     program_arguments,
     with_recorders_on,
 )
+from caneflow.runtime.hosts import last_words
 from caneflow.runtime.hosts.clocks import Answer, Clocks
+from caneflow.runtime.hosts.last_words import LastWords
 from caneflow.runtime.hosts.links import Ports, open_session
 from caneflow.runtime.hosts.machines import (
     LINK_SETTINGS,
@@ -37,6 +39,7 @@ from caneflow.runtime.hosts.machines import (
 from caneflow.runtime.hosts.nursery import Nursery
 from caneflow.runtime.hosts.observations import Observations
 from caneflow.runtime.hosts.processes import Exited, Line, NurseryLost, Processes
+from caneflow.runtime.hosts.restarts import Again, How, Restarts
 from caneflow.runtime.hosts.run_directory import RunDirectory, remove_state_folder, state_folder
 from caneflow.runtime.hosts.security import links_between
 from caneflow.runtime.plan import NodePlan
@@ -50,6 +53,8 @@ LEADER_PATIENCE = 120.0  # s that the part of a replay waits for its leader to c
 WAITING_SAID = 10.0  # s after which a launcher says again whom it waits for
 WINDOW_PERIOD = 1.0  # s after which the window of a replay is said again
 WAKE_PERIOD = 0.2  # s between two looks at deadlines
+
+CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)  # of a program by itself
 
 LAUNCHER = "caneflow"  # the launcher's name in the merged log
 RECORDER_RESTART = Restart(
@@ -92,17 +97,18 @@ class NodeState:
     """What the launcher knows of one node."""
 
     plan: NodePlan
-    restart: Restart
+    policy: Restarts
     here: bool = True  # False: another machine's launcher starts it
     state: str = "starting"  # starting, ready, waiting (for its restart), failed; away: on a machine out of reach
     pid: int = 0
     started_at: float = 0.0  # s, monotonic
     restart_at: float = 0.0  # s, monotonic
     restarts: int = 0
-    restarted: list[float] = field(default_factory=list)  # s, monotonic: the restarts within the policy's window
     handled: int = BEGIN
     counters: Counters | None = None
     last_line: str = ""
+    last_words: LastWords | None = None  # of the process that is ending
+    shown: set[str] = field(default_factory=set)  # places of errors whose traceback was shown
 
 
 @dataclass
@@ -223,10 +229,13 @@ class Launcher:
             # The next launcher on this machine may go on where this one was killed, if the same leader still runs.
             self._state_folder = state_folder(deployment.flow, self._company.site.name, self._company.leader_run)
         self._nodes = {
-            name: NodeState(plan, self._restarts.get(name, RECORDER_RESTART), here=deployment.runs_here(name))
+            name: NodeState(plan, self._policy(name), here=deployment.runs_here(name))
             for name, plan in deployment.plans.items()
             if self._leads or deployment.runs_here(name)
         }
+
+    def _policy(self, node: str) -> Restarts:
+        return Restarts(self._restarts.get(node, RECORDER_RESTART), replay=self._deployment.replay)
 
     def _take_word(self, company: Company, word: Word) -> None:
         """Take what another machine's launcher says."""
@@ -328,16 +337,17 @@ class Launcher:
             self._observed.look(self._nodes.values())
 
     def _next_events(self) -> Iterator[object]:
+        now = time.monotonic()
+        restarts = [node.restart_at - now for node in self._nodes.values() if node.state == "waiting"]
         with suppress(queue.Empty):
-            yield self._events.get(timeout=WAKE_PERIOD)
+            yield self._events.get(timeout=max(0.0, min([WAKE_PERIOD, *restarts])))
             while not self._events.empty():
                 yield self._events.get_nowait()
 
     def _take(self, event: object) -> None:
         match event:
             case Line(node, text):
-                self._nodes[node].last_line = text or self._nodes[node].last_line
-                self._report(node, text)
+                self._take_line(self._nodes[node], text)
             case Ready(node, there) if node in self._nodes:
                 self._take_ready(self._nodes[node], there=there)
             case Exited():
@@ -361,6 +371,20 @@ class Launcher:
                 status = self._observed.status(deployment.flow, machine, here, replay=deployment.replay)
                 with query:
                     query.reply(query.key_expr, encode(status))
+
+    def _take_line(self, node: NodeState, text: str) -> None:
+        words = last_words.heard(text)
+        text = text if words is None else text.partition(last_words.MARK)[0]  # that of a line without an end
+        if words is None or text:
+            node.last_line = text or node.last_line
+            self._report(node.plan.node, text)
+        if words is None:
+            return
+        node.last_words, node.last_line = words, words.error
+        if words.place not in node.shown:
+            node.shown.add(words.place)
+            for line in words.lines:
+                self._report(node.plan.node, line)
 
     def _take_said(self, said: Said) -> None:
         try:
@@ -390,6 +414,7 @@ class Launcher:
                 node.state = "away"
             return  # the end of a process of this machine is told by the process
         node.state = "ready"
+        node.policy.ready(time.monotonic())
         if self._leads and all(other.state == "ready" for other in self._nodes.values()):
             self._pass_barrier()
         if self._barrier_passed:
@@ -403,25 +428,32 @@ class Launcher:
     def _take_exit(self, node: NodeState, exited: Exited) -> None:
         if exited.pid != node.pid:
             return
-        cause = f"killed by {signal.Signals(-exited.status).name}" if exited.status < 0 else f"status {exited.status}"
-        self._restart_or_fail(node, f"ended with {cause}")
+        words, status = node.last_words, exited.status
+        reached = f"up to stamp {node.handled}"
+        cause = f"ended with killed by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
+        if words is not None:
+            how = How.LASTING if words.lasting else How.FAULT
+            self._restart_or_fail(node, cause, how, words.at)
+        elif -status in CRASHES or status >= 0:
+            self._restart_or_fail(node, cause, How.FAULT, reached)
+        else:
+            self._restart_or_fail(node, cause, How.STOPPED, reached)
 
-    def _restart_or_fail(self, node: NodeState, cause: str) -> None:
-        name, policy = node.plan.node, node.restart
-        now = time.monotonic()
-        node.restarted = [moment for moment in node.restarted if now - moment < policy.window_s]
-        if policy.policy == "never" or len(node.restarted) >= policy.max_restarts:
+    def _restart_or_fail(self, node: NodeState, cause: str, how: How, at: object) -> None:
+        name, now = node.plan.node, time.monotonic()
+        verdict = node.policy.ended(now, at, how)
+        if not isinstance(verdict, Again):
             node.state = "failed"
             tried = f" after {node.restarts} restarts" if node.restarts else ""
-            said = f": {node.last_line}" if node.last_line else ""
-            self._outcome.failures.append(f"{name} {cause}{tried}{said}")
+            parts = (f"{name} {cause}{tried}", verdict.why, node.last_line)
+            self._outcome.failures.append(": ".join(filter(None, parts)))
             return
-        delay = min(policy.delay_s * 2 ** len(node.restarted), policy.max_delay_s)
         node.restarts += 1
-        node.restarted.append(now)
         node.state = "waiting"
-        node.restart_at = now + delay
-        self._report(name, f"{cause}; restart {len(node.restarted)} of {policy.max_restarts} in {delay:g} s")
+        node.restart_at = now + verdict.delay_s
+        again = f"restart {node.policy.counted} of {node.policy.allowed} in {verdict.delay_s:g} s"
+        said = f": {node.last_words.error}" if node.last_words else ""
+        self._report(name, f"{cause}{said}; {again}")
 
     # --- what goes out ----------------------------------------------------------------------------------------
 
@@ -436,7 +468,7 @@ class Launcher:
             away = self._company.out_of_reach(plan.readers)
             plan = msgspec.structs.replace(plan, absent=away, state_folder=folder)
         plan.write(path)
-        node.state = "starting"
+        node.state, node.last_words = "starting", None
         node.started_at = time.monotonic()
         node.pid = self._processes.start(node.plan.node, program_arguments(node.plan), path)
 
@@ -452,7 +484,8 @@ class Launcher:
             elif node.state == "starting" and now - node.started_at > node.plan.ready_timeout_s:
                 self._processes.kill(node.plan.node)
                 pid, node.pid = node.pid, 0  # its exit is told here
-                self._restart_or_fail(node, f"not ready after {node.plan.ready_timeout_s:g} s (pid {pid} killed)")
+                cause = f"not ready after {node.plan.ready_timeout_s:g} s (pid {pid} killed)"
+                self._restart_or_fail(node, cause, How.STOPPED, None)
 
     def _open_window(self) -> None:
         """Let the sources of a replay go on: as far as the slowest reader, and a window beyond."""
@@ -494,7 +527,7 @@ class Launcher:
         while not self._events.empty():
             match self._events.get_nowait():
                 case Line(node, text):
-                    self._report(node, text)
+                    self._take_line(self._nodes[node], text)
                 case Said() as said:
                     self._take_said(said)
 
@@ -502,7 +535,9 @@ class Launcher:
         nodes = self._nodes.items()
         self._outcome.counters = {name: node.counters for name, node in nodes if node.counters is not None}
         if self._deployment.replay and not self._outcome.interrupted:
+            failures, self._outcome.failures = self._outcome.failures, []
             note_losses(self._outcome)
+            self._outcome.failures += failures  # last, as it is the cause
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
@@ -515,6 +550,13 @@ class Launcher:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # of the real-time signals only two have names
+        return f"signal {number}"
 
 
 def note_losses(outcome: Outcome) -> None:

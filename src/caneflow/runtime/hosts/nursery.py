@@ -24,6 +24,8 @@ from typing import NoReturn
 import msgspec
 from setproctitle import setproctitle, setthreadtitle
 
+from caneflow.runtime.hosts.last_words import telling_failures
+
 REQUEST_BYTES = 65_536  # of the longest command line
 PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal for a process whose parent dies
 RESET = (signal.SIGTERM, signal.SIGCHLD)
@@ -161,13 +163,14 @@ def _become(arguments: Sequence[str], output: int, parent: int) -> None:
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # typeshed takes them for any TextIO
     setproctitle(" ".join(("python", *arguments)))
     setthreadtitle(Path(arguments[-1]).stem)  # the node's name, where only fifteen letters are shown
-    if arguments[0] == "-m":
-        sys.argv = list(arguments[1:])
-        runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
-    else:
-        sys.argv = list(arguments)
-        sys.path.insert(0, str(Path(arguments[0]).parent))
-        runpy.run_path(arguments[0], run_name="__main__")
+    with telling_failures(building=True):  # before the program has come to its own `run`
+        if arguments[0] == "-m":
+            sys.argv = list(arguments[1:])
+            runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+        else:
+            sys.argv = list(arguments)
+            sys.path.insert(0, str(Path(arguments[0]).parent))
+            runpy.run_path(arguments[0], run_name="__main__")
 
 
 def _end(work: Callable[[], None]) -> NoReturn:
