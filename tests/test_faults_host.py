@@ -1,19 +1,23 @@
 """What a host does to a live flow: a full disk, a clock that is set, samples that never come. Real processes."""
 
+import json
 import re
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 
-from caneflow.messages import Imu, Pose, numbered
-from caneflow.recording import Recording, RecordingWriter
+from caneflow.messages import Imu, Pose, RadarFrame, numbered
+from caneflow.recording import Recording, RecordingWriter, recover
 from caneflow.recording.parts import LastSeconds, RotatingWriter, Rotation
-from tests.flows import CANEFLOW, Launched, launchers, write_walk
+from tests.flows import CANEFLOW, Launched, launchers, wait_for, write_walk
 
 Launch = Callable[..., Launched]
 
@@ -147,30 +151,25 @@ def variances(pose: Pose) -> list[float]:
     return [float(pose.covariance[axis, axis]) for axis in range(3)]
 
 
-NOISE = '''
-"""A live source: radar frames of noise, 2 kB each, that no compression makes smaller."""
+TICKER = '''
+"""A live source: an IMU that ticks at 100 Hz."""
 import time
-import numpy as np
-from caneflow.messages import RadarFrame
+from caneflow.messages import Imu
 from caneflow.runtime import Source
 from caneflow.runtime.node import run
 
-class Noise(Source):
-    outputs = {"frame": RadarFrame}
+class Ticker(Source):
+    outputs = {"imu": Imu}
 
     def __init__(self, settings, context): ...
 
     def samples(self):
-        rng = np.random.default_rng(1)
         while True:
-            time.sleep(0.002)
-            yield "frame", RadarFrame(
-                stamp=time.time_ns(), scans=rng.integers(-(2**31), 2**31 - 1, (1, 480), dtype=np.int32),
-                scan_period=0.01, range_start=0.5, range_step=0.009, carrier=4.3e9, bandwidth=1.7e9,
-            )
+            time.sleep(0.01)
+            yield "imu", Imu(stamp=time.time_ns(), gyro=(0.0, 0.0, 0.0))
 
 if __name__ == "__main__":
-    run(Noise)
+    run(Ticker)
 '''
 
 # What is on the disk goes with the namespace it was mounted in, so it is copied out.
@@ -189,15 +188,37 @@ def small_disk(tmp_path: Path) -> tuple[Path, list[str]]:
     return disk, inside
 
 
+@pytest.fixture(scope="module")
+def noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of 600 radar frames of noise, 2 kB each, that no compression makes smaller."""
+    path = tmp_path_factory.mktemp("noise") / "noise.mcap"
+    rng = np.random.default_rng(1)
+    with RecordingWriter(path, flow="elsewhere", source="simulated", rig={}) as writer:
+        for seq in range(600):
+            stamp = 10_000_000 * (seq + 1)
+            frame = RadarFrame(
+                stamp=stamp,
+                scans=rng.integers(-(2**31), 2**31 - 1, (1, 480), dtype=np.int32),
+                scan_period=0.01,
+                range_start=0.5,
+                range_step=0.009,
+                carrier=4.3e9,
+                bandwidth=1.7e9,
+            )
+            key = "elsewhere/radar/frame"
+            writer.write(key, RadarFrame, numbered(frame, seq), stamp=stamp, seq=seq, log_time=stamp)
+    return path
+
+
 @pytest.mark.parametrize("options", [[], ["--rotate", "300kB"]])
-def test_a_disk_that_fills_up_ends_the_run_with_one_line_and_a_file_that_can_be_read(
-    launch: Launch, tmp_path: Path, flow: str, small_disk: tuple[Path, list[str]], options: list[str]
+def test_in_a_replay_a_disk_that_fills_up_ends_the_run_with_one_line_and_a_file_that_can_be_read(
+    launch: Launch, tmp_path: Path, flow: str, small_disk: tuple[Path, list[str]], options: list[str], noise: Path
 ) -> None:
     disk, inside = small_disk
-    (tmp_path / "noise.py").write_text(NOISE)
     file = tmp_path / "dataflow.yaml"
-    file.write_text(f"flow: {flow}\nnodes:\n  noise: {{run: ./noise.py}}\nresults: [noise/frame]\n")
-    launched = launch("run", file, "--record", disk / "out.mcap", *options, log=tmp_path / "run.log", inside=inside)
+    file.write_text(f"flow: {flow}\nnodes:\n  radar: {{run: drivers.p440}}\nresults: [radar/frame]\n")
+    command = ["run", file, "--replay", noise, "--speed", "4", "--record", disk / "out.mcap", *options]
+    launched = launch(*command, log=tmp_path / "run.log", inside=inside)
 
     assert launched.ends() == 1, launched.said
     assert "Traceback" not in launched.said
@@ -213,6 +234,57 @@ def test_a_disk_that_fills_up_ends_the_run_with_one_line_and_a_file_that_can_be_
     assert seqs == list(range(len(seqs)))
     assert len(seqs) > 400, "2 kB each, on 1 MB"
     assert not processes_of(flow)
+
+
+def test_live_the_flow_goes_on_while_its_disk_is_full_and_the_recording_when_there_is_room(
+    launch: Launch, tmp_path: Path, flow: str, small_disk: tuple[Path, list[str]]
+) -> None:
+    """Full from the start, then with room, then full again."""
+    disk, inside = small_disk
+    (tmp_path / "ticker.py").write_text(TICKER)
+    file = tmp_path / "dataflow.yaml"
+    file.write_text(f"flow: {flow}\nnodes:\n  ticker: {{run: ./ticker.py}}\nresults: [ticker/imu]\n")
+    filled = 'cat /dev/zero > "$0"/filler; exec "$@"'
+    inside = [*inside[:-1], str(disk), "sh", "-c", filled, str(disk)]
+    launched = launch("run", file, "--record", disk / "out.mcap", log=tmp_path / "run.log", inside=inside)
+
+    launched.wait_for("No space left on device")
+    launched.wait_for("THE FLOW GOES ON WITHOUT ITS RECORDING")
+    on_disk = Path(f"/proc/{launched.process.pid}/root") / disk.relative_to("/")
+    before = sent(flow)
+    assert before["state"] in ("waiting", "starting")
+    assert "No space left on device" in before["said"]
+    (on_disk / "filler").unlink()
+    launched.wait_for("recorder | is there again, after")
+    part = on_disk / "out_001.mcap"
+    wait_for(lambda: part.stat().st_size > 10_000, "samples on the disk")
+    with suppress(OSError), (on_disk / "filler").open("wb", buffering=0) as filler:
+        while True:
+            filler.write(bytes(4096))
+    wait_for(lambda: launched.said.count("THE FLOW GOES ON WITHOUT ITS RECORDING") == 2, "a full disk")
+    after = sent(flow)
+    assert after["ticker"] > before["ticker"], "it went on"
+    (run,) = psutil.Process(launched.process.pid).children()  # of the shell
+    run.send_signal(signal.SIGINT)
+    assert launched.ends() == 130, launched.said
+    last = launched.said.splitlines()[-1]
+    assert re.fullmatch(r"caneflow run: recorder: the recording is incomplete: .*No space left on device.*", last)
+    assert "Traceback" not in launched.said
+
+    assert sorted(path.name for path in tmp_path.glob("out*")) == ["out_001.mcap"], "one that holds nothing is removed"
+    with Recording(tmp_path / "out_001.mcap") as recording:
+        seqs = [sample.seq for sample in recording.samples()]
+    assert seqs == list(range(len(seqs))), "what came before there was room was asked for"
+    recovered = recover(tmp_path / "out_001.mcap", tmp_path / "sound.mcap")
+    assert sum(recovered.messages.values()) == len(seqs)
+
+
+def sent(flow: str) -> dict[str, Any]:
+    """What `status` says: the samples that the ticker has sent; state and last line of the recorder."""
+    status = subprocess.run([*CANEFLOW, "status", flow, "--json"], capture_output=True, check=True, timeout=60)
+    nodes = json.loads(status.stdout)["nodes"]
+    recorder = nodes["recorder"]
+    return {"ticker": nodes["ticker"]["sent"]["imu"], "state": recorder["state"], "said": recorder["said"]}
 
 
 def test_a_disk_that_is_full_is_one_line_of_a_tool(tmp_path: Path, small_disk: tuple[Path, list[str]]) -> None:

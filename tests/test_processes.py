@@ -358,6 +358,43 @@ def test_what_a_restart_would_not_mend_is_not_tried_again(
     assert re.fullmatch(f"caneflow run: echo ended with status 1: a restart would not mend it: {error}", last)
 
 
+def test_a_killed_recorder_or_a_lost_folder_ends_no_live_flow(
+    live: Path, tmp_path: Path, start: Callable[..., Running]
+) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    out, again, last = folder / "out.mcap", folder / "out_001.mcap", folder / "out_002.mcap"
+    running = start("run", live, "--record", out)
+    wait_for(lambda: out.exists() and out.stat().st_size > 10_000, "the first part")
+    echo, ticker = running.node("echo"), running.node("ticker")
+    running.node("recorder").kill()
+    wait_for(lambda: again.exists() and again.stat().st_size > 10_000, "the second part")
+    folder.rename(tmp_path / "elsewhere")
+    wait_for(lambda: "recorder" not in node_processes(running.process.pid), "the end of a recorder without a folder")
+    folder.mkdir()
+    (folder / "out_001.mcap").write_text("of somebody else")
+    wait_for(lambda: last.exists() and last.stat().st_size > 10_000, "the third part")
+    assert (running.node("echo").pid, running.node("ticker").pid) == (echo.pid, ticker.pid)
+    status, output = running.end(signal.SIGINT)
+    assert status == 130, output
+    assert "incomplete" not in output, "it records at the end"
+    assert output.count("THE FLOW GOES ON WITHOUT ITS RECORDING") == 2
+    assert output.count("recorder | is there again, after") == 2
+    assert again.read_text() == "of somebody else"
+
+    seqs, runs = list[int](), set[str]()
+    for number, part in enumerate((tmp_path / "elsewhere/out.mcap", tmp_path / "elsewhere/out_001.mcap", last)):
+        with Recording(part) as recording:
+            runs.add(recording.metadata["run"])
+            assert recording.metadata.get("part", "0") == str(number)
+            seqs.append(-1)
+            for sample in recording.samples([("echo", "imu")]):
+                assert sample.seq == seqs[-1] + 1 or seqs[-1] == -1, f"{part}: complete in itself"
+                seqs.append(sample.seq)
+    assert len(runs) == 1
+    assert not re.search(r"recorder: .*lost", output), "what the parts before hold is not counted as lost"
+
+
 def test_a_node_that_hangs_before_it_is_ready_is_named(
     live: Path, tmp_path: Path, start: Callable[..., Running]
 ) -> None:

@@ -1,5 +1,6 @@
 """A recording in parts: by size, by time, and the last seconds when somebody asks."""
 
+import errno
 import itertools
 import json
 import sys
@@ -75,6 +76,68 @@ def test_a_part_by_time_holds_that_much_and_all_together_everything(tmp_path: Pa
     with Recording(parts[0]) as first, Recording(parts[4]) as last:
         assert first.metadata["run"] == last.metadata["run"]
         assert (first.metadata["part"], last.metadata["part"]) == ("0", "4")
+
+
+def test_a_recorder_in_the_place_of_another_goes_on_in_the_next_part(tmp_path: Path) -> None:
+    path = tmp_path / "walk.mcap"
+    for begin, goes_on in ((0, False), (100, True), (200, True)):
+        further = recorder(path, run="one", goes_on=goes_on)
+        feed(further, range(begin, begin + 100))
+        further.finish()
+    names = ["walk.mcap", "walk_001.mcap", "walk_002.mcap"]
+    assert sorted(part.name for part in tmp_path.iterdir()) == names
+    for number, name in enumerate(names):
+        assert seqs_of(tmp_path / name) == list(range(100 * number, 100 * number + 100))
+        with Recording(tmp_path / name) as part:
+            assert (part.metadata["run"], part.metadata["source"]) == ("one", "live")
+            assert part.metadata.get("part") == (str(number) if number else None)
+
+
+def test_what_is_kept_is_counted_over_a_restart_of_the_recorder(tmp_path: Path) -> None:
+    path = tmp_path / "walk.mcap"
+    other = recorder(path, run="of another day", rotate_s=1.0)
+    feed(other, range(100))
+    other.finish()
+    for begin, goes_on in ((0, False), (300, True)):
+        parts = recorder(path, run="one", rotate_s=1.0, keep=2, goes_on=goes_on)
+        feed(parts, range(begin, begin + 300))
+        parts.finish()
+    assert [part.name for part in sorted(tmp_path.iterdir())] == ["walk_000.mcap", "walk_005.mcap", "walk_006.mcap"]
+    assert seqs_of(part_path(path, 6)) == list(range(500, 600))
+
+
+def test_on_a_disk_that_is_nearly_full_no_part_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("caneflow.recording.parts.LEAST_ROOM", sys.maxsize)
+    with pytest.raises(RecordingError, match=r"walk\.mcap: cannot go on: No space left on device") as refused:
+        recorder(tmp_path / "walk.mcap", goes_on=True)
+    assert isinstance(refused.value.__cause__, OSError), "so it is tried again"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("loss", ["removed", "replaced", "moved with its folder"])
+def test_a_file_that_lost_its_name_is_not_written_on(tmp_path: Path, loss: str) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    recording = recorder(folder / "walk.mcap")
+    feed(recording, range(50))
+    if loss == "moved with its folder":
+        folder.rename(tmp_path / "elsewhere")
+    else:
+        (folder / "walk.mcap").unlink()
+    if loss == "replaced":
+        (folder / "walk.mcap").write_bytes(b"of somebody else")
+    with pytest.raises(RecordingError, match="was removed or moved while it was written"):
+        feed(recording, range(50, 200))  # within the next second
+
+
+def test_a_recording_that_could_not_begin_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RecordingWriter, "_flush", full)
+    with pytest.raises(RecordingError, match="No space left on device"):
+        recorder(tmp_path / "walk.mcap")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_part_by_size_is_not_much_larger(tmp_path: Path) -> None:

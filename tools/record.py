@@ -11,7 +11,15 @@ import msgspec
 
 from caneflow.messages import Pose, Sample, sample_key
 from caneflow.recording import Recorded, Recording, RecordingError, RecordingWriter, require_writable
-from caneflow.recording.parts import LastSeconds, RotatingWriter, Rotation, part_path
+from caneflow.recording.parts import (
+    LastSeconds,
+    RotatingWriter,
+    Rotation,
+    further_part,
+    part_path,
+    parts_of,
+    require_room,
+)
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.node import run
 
@@ -34,6 +42,8 @@ class RecordSettings:
     rotate_s: float | None = None  # s, a new file after this long
     keep: int | None = None  # files; older ones of this run are removed
     last_s: float | None = None  # s that are kept in memory, to be written when somebody asks; nothing else is
+    run: str | None = None  # the id of the run, the same in all its parts; None: a new one
+    goes_on: bool = False  # in the place of a recorder that has ended: what that one wrote is left alone
 
 
 class Recorder(Sink):
@@ -44,7 +54,7 @@ class Recorder(Sink):
     def __init__(self, settings: RecordSettings, context: Context) -> None:
         self._flow = settings.flow
         self._settings = settings
-        self._run = uuid.uuid4().hex
+        self._run = settings.run or uuid.uuid4().hex
         self._writer = self._writer_of(settings)
         self._truth = _truth(settings.truth_from)
         self._next_truth = next(self._truth, None)
@@ -87,10 +97,25 @@ class Recorder(Sink):
         if settings.last_s is not None:
             require_writable(part_path(path, 0))
             return LastSeconds(path, settings.last_s, self._part)
+        if settings.goes_on:
+            require_room(path)
         if settings.rotate_bytes is None and settings.rotate_s is None:
+            if settings.goes_on:
+                part = further_part(path, self._part)
+                log.info("goes on in %s", part.path)
+                return part
             return RecordingWriter(path, flow=settings.flow, source=settings.source, rig=settings.rig, run=self._run)
         rotation = Rotation(size=settings.rotate_bytes, span_s=settings.rotate_s, keep=settings.keep)
-        return RotatingWriter(path, rotation, self._part)
+        written = filter(self._is_ours, parts_of(path)) if settings.goes_on and settings.keep else ()
+        return RotatingWriter(path, rotation, self._part, written)
+
+    def _is_ours(self, part: Path) -> bool:
+        """Whether this run has written the part."""
+        try:
+            with Recording(part) as recording:
+                return recording.metadata.get("run") == self._run
+        except RecordingError:  # nobody's, and not to be removed
+            return False
 
     def _part(self, path: Path, number: int) -> RecordingWriter:
         settings = self._settings

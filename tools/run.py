@@ -117,7 +117,7 @@ def summary(deployment: Deployment, outcome: Outcome, took_s: float) -> None:
     for node, counters in outcome.counters.items():
         if text := _counted(counters):
             print(f"{node}: {text}", flush=True)  # before the failures, wherever both go
-    for failure in outcome.failures:
+    for failure in (*outcome.unrecorded, *outcome.failures):
         print(f"caneflow run: {failure}", file=sys.stderr)
     if not outcome.failures and not outcome.interrupted:
         print(f"{deployment.flow}: ran to its end in {took_s:.1f} s")

@@ -1,8 +1,10 @@
 """A recording in parts: a new file by size or time, or the last seconds when somebody asks for them."""
 
+import errno
+import os
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -14,6 +16,7 @@ from caneflow.recording.writer import RecordingWriter
 
 SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}  # bytes
 SPANS = {"s": 1, "min": 60, "h": 3600}  # s
+LEAST_ROOM = 512 * 1024  # bytes on a disk that has been full, before a recorder begins another part there
 LARGEST_BUFFER = 512 * 2**20  # bytes of samples that are kept in memory: a gateway has more to do
 
 Opener: TypeAlias = Callable[[Path, int], RecordingWriter]  # path and number of a part -> its writer
@@ -56,15 +59,37 @@ def part_path(path: Path, number: int) -> Path:
     return path.with_name(f"{path.stem}_{number:03}{path.suffix}")
 
 
+def parts_of(path: Path) -> list[Path]:
+    """The parts of the recording `path` that exist, of whatever run, by their numbers."""
+    return [part_path(path, number) for number in sorted(_numbers(path))]
+
+
+def further_part(path: Path, opener: Opener) -> RecordingWriter:
+    """The part that follows `path` itself and its parts that are there: walk_001.mcap after walk.mcap."""
+    number = next(_free_numbers(path, first=1))
+    return opener(part_path(path, number), number)
+
+
+def require_room(path: Path) -> None:
+    """Raise RecordingError where the disk of `path` is full, or nearly: a part would end as soon as it has begun."""
+    try:
+        disk = os.statvfs(path.parent)
+        if disk.f_bavail * disk.f_frsize < LEAST_ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot go on: {error.strerror}") from error
+
+
 class RotatingWriter:
     """Writes one part after the other, each a sound recording by itself; files that are there are left alone."""
 
-    def __init__(self, path: Path, rotation: Rotation, opener: Opener) -> None:
+    def __init__(self, path: Path, rotation: Rotation, opener: Opener, written: Iterable[Path] = ()) -> None:
+        """`written`: parts that this run has written already."""
         self._path = path
         self._rotation = rotation
         self._open = opener
         self._numbers = _free_numbers(path)
-        self._written: deque[Path] = deque()
+        self._written: deque[Path] = deque(written)
         self._began: int | None = None  # log time (ns) of the part's first sample
         self._writer = self._next_part()
 
@@ -186,11 +211,14 @@ class LastSeconds:
         self._size -= len(self._kept.popleft().payload)
 
 
-def _free_numbers(path: Path) -> "count[int]":
-    """The numbers of parts that come after those that are there."""
+def _free_numbers(path: Path, first: int = 0) -> "count[int]":
+    """The numbers of parts that come after those that are there, from `first` on."""
+    return count(max(_numbers(path), default=first - 1) + 1)
+
+
+def _numbers(path: Path) -> list[int]:
     pattern = re.compile(re.escape(path.stem) + r"_(\d{3,})" + re.escape(path.suffix))
-    there = [int(found[1]) for each in path.parent.glob(f"*{path.suffix}") if (found := pattern.fullmatch(each.name))]
-    return count(max(there, default=-1) + 1)
+    return [int(found[1]) for each in path.parent.glob(f"*{path.suffix}") if (found := pattern.fullmatch(each.name))]
 
 
 def _quantity(text: str) -> tuple[float, str]:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -65,11 +66,16 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(_cannot_open(self.path, error)) from error
         self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE, compression=COMPRESSIONS[compression])
-        with self._ending_at_failure():
-            self._mcap.start(library=f"caneflow {caneflow.__version__}")
-            self._mcap.add_metadata("caneflow", about)
-            self._mcap.add_metadata("rig", bolted_on)
-            self._flush()
+        try:
+            with self._ending_at_failure():
+                self._mcap.start(library=f"caneflow {caneflow.__version__}")
+                self._mcap.add_metadata("caneflow", about)
+                self._mcap.add_metadata("rig", bolted_on)
+                self._flush()
+        except RecordingError:
+            if self.path.is_file() and not self.path.is_symlink():  # it holds nothing
+                self.path.unlink(missing_ok=True)
+            raise
 
     def write(self, key: str, kind: type[Sample], payload: bytes, *, stamp: int, seq: int, log_time: int) -> None:
         """Add sample `seq` of the stream `key`: its bytes as sent; stamp and time of reception in ns."""
@@ -97,6 +103,7 @@ class RecordingWriter:
             return
         with self._ending_at_failure():
             self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without a return type
+            self._require_there()
             self._file.close()
 
     def __enter__(self) -> Self:
@@ -117,6 +124,14 @@ class RecordingWriter:
 
     def _flush(self) -> None:
         self._mcap.flush()  # type: ignore[no-untyped-call]  # mcap leaves it without a return type
+        self._require_there()
+
+    def _require_there(self) -> None:
+        """Raise OSError when the file has lost its name: one can go on writing to it, and nobody will read that."""
+        with suppress(FileNotFoundError):
+            if os.path.samestat(self.path.stat(), os.fstat(self._file.fileno())):
+                return
+        raise FileNotFoundError(errno.ENOENT, "the file was removed or moved while it was written")
 
     def _channel(self, key: str, schema_name: str, kind: type[Sample] | None) -> int:
         if known := self._channels.get(key):

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -365,6 +366,7 @@ def _recorder(
         "flow": graph.flow,
         "rig": rig,
         "source": "replayed" if replay else "live",
+        "run": uuid.uuid4().hex,
         "truth_from": str(replay.recording.resolve()) if replay and carries_truth else None,
     }
     return NodePlan(

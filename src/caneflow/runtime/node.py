@@ -270,6 +270,7 @@ class _ReaderNode(ABC):
                     self.take_message(event, message)
             case Answered():
                 self._unanswered.pop(event.port, None)
+                self.begin_at(event.port, event.first)
                 self.reader.mark(event.port, event.mark)
                 if event.first > self.reader.inputs[event.port].expected:
                     self.skip_to(event.port, event.first)  # the writer does not have what lies before it any more
@@ -336,6 +337,9 @@ class _ReaderNode(ABC):
             elif now >= missing.ask_at:
                 self.bus.ask_again(port, arrivals.expected)
                 missing.ask_at = now + ASK_PERIOD
+
+    def begin_at(self, port: str, seq: int) -> None:  # noqa: B027 - an operator goes on from its snapshot
+        """Hear that the writer has no sample before `seq` any more."""
 
     @abstractmethod
     def skip_to(self, port: str, seq: int) -> None:
@@ -587,6 +591,13 @@ class _SinkNode(_ReaderNode):
 
     def take_message(self, arrived: Arrived, message: Sample) -> None:
         self.tap.offer(arrived.port, message, arrived.payload, time.time_ns(), again=arrived.again)
+
+    def begin_at(self, port: str, seq: int) -> None:
+        """In the place of another: what lies before the writer's oldest sample was that one's, and is not lost."""
+        arrivals = self.tap.inputs[port]
+        if self.plan.takes_over and arrivals.handled_seq < 0 and seq > arrivals.expected:
+            arrivals.expected = seq
+            self.skip_to(port, seq)
 
     def skip_to(self, port: str, seq: int) -> None:
         self.tap.skip_to(port, seq, time.time_ns())

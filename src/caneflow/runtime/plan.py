@@ -71,6 +71,7 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
     links: Links = Links()
     machine: str = ""  # that the node runs on, when there are several
     absent: tuple[str, ...] = ()  # readers on machines that are not there: the node does not wait for them
+    takes_over: bool = False  # in the place of a process that ended: what that one had taken is not missing
     state_folder: str | None = None  # where snapshots are kept; None: beside the plan
     ready_timeout_s: float = 20.0
 

@@ -3,6 +3,7 @@
 import logging
 import queue
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -16,6 +17,7 @@ from caneflow.messages import MessageError, control_key, decode, encode
 from caneflow.messages.control import Counters, Progress, Window
 from caneflow.runtime.dataflow.graph import Restart
 from caneflow.runtime.deployment import (
+    RECORDER_MODULE,
     REPLAYER_MODULE,
     Deployment,
     linked,
@@ -57,9 +59,13 @@ WAKE_PERIOD = 0.2  # s between two looks at deadlines
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)  # of a program by itself
 
 LAUNCHER = "caneflow"  # the launcher's name in the merged log
-RECORDER_RESTART = Restart(
+RECORDER_RESTART = Restart(  # of a replay: its recording is its result
     policy="never", max_restarts=0, window_s=0.0, delay_s=0.0, max_delay_s=0.0
-)  # would overwrite
+)
+LIVE_RECORDER_RESTART = Restart(  # where the position is worth more than its recording: without end
+    policy="always", max_restarts=sys.maxsize, window_s=60.0, delay_s=0.25, max_delay_s=10.0
+)
+FAILING_SAID = 60.0  # s after which the launcher says again that the flow goes on without its recorder
 
 Report = Callable[[str, str], None]  # (node, line)
 
@@ -98,6 +104,7 @@ class NodeState:
 
     plan: NodePlan
     policy: Restarts
+    spare: bool = False  # a live flow goes on without it: its recorder
     here: bool = True  # False: another machine's launcher starts it
     state: str = "starting"  # starting, ready, waiting (for its restart), failed; away: on a machine out of reach
     pid: int = 0
@@ -109,6 +116,13 @@ class NodeState:
     last_line: str = ""
     last_words: LastWords | None = None  # of the process that is ending
     shown: set[str] = field(default_factory=set)  # places of errors whose traceback was shown
+    failing_since: float | None = None  # s, monotonic: of a spare one that cannot be had now
+    say_at: float = 0.0  # s, monotonic: when to say so again
+
+    @property
+    def missing(self) -> bool:
+        """Whether it is a spare one that could not even be started again."""
+        return self.spare and (self.state == "away" or (self.failing_since is not None and self.policy.counted > 1))
 
 
 @dataclass
@@ -119,11 +133,12 @@ class Outcome:
     interrupted: bool = False
     counters: dict[str, Counters] = field(default_factory=dict)
     span_s: float = 0.0  # of event time, in a replay
+    unrecorded: list[str] = field(default_factory=list)  # why the recording of a live flow is incomplete
 
     @property
     def status(self) -> int:
         """The command's exit status."""
-        return 1 if self.failures else 130 if self.interrupted else 0
+        return 1 if self.failures else 130 if self.interrupted else 1 if self.unrecorded else 0
 
 
 class Launcher:
@@ -229,13 +244,16 @@ class Launcher:
             # The next launcher on this machine may go on where this one was killed, if the same leader still runs.
             self._state_folder = state_folder(deployment.flow, self._company.site.name, self._company.leader_run)
         self._nodes = {
-            name: NodeState(plan, self._policy(name), here=deployment.runs_here(name))
+            name: self._node(plan, here=deployment.runs_here(name))
             for name, plan in deployment.plans.items()
             if self._leads or deployment.runs_here(name)
         }
 
-    def _policy(self, node: str) -> Restarts:
-        return Restarts(self._restarts.get(node, RECORDER_RESTART), replay=self._deployment.replay)
+    def _node(self, plan: NodePlan, *, here: bool) -> NodeState:
+        replay = self._deployment.replay
+        recorder = RECORDER_RESTART if replay else LIVE_RECORDER_RESTART
+        policy = Restarts(self._restarts.get(plan.node, recorder), replay=replay)
+        return NodeState(plan, policy, spare=plan.module == RECORDER_MODULE and not replay, here=here)
 
     def _take_word(self, company: Company, word: Word) -> None:
         """Take what another machine's launcher says."""
@@ -414,11 +432,22 @@ class Launcher:
                 node.state = "away"
             return  # the end of a process of this machine is told by the process
         node.state = "ready"
-        node.policy.ready(time.monotonic())
-        if self._leads and all(other.state == "ready" for other in self._nodes.values()):
-            self._pass_barrier()
+        now = time.monotonic()
+        node.policy.ready(now)
+        if node.failing_since is not None:
+            self._report(node.plan.node, f"is there again, after {now - node.failing_since:.1f} s")
+            node.failing_since = None
+        self._pass_barrier_if_all_are_ready()
         if self._barrier_passed:
             self._say_start()
+
+    def _pass_barrier_if_all_are_ready(self) -> None:
+        """Nobody waits for a spare node that is on another machine, or has failed."""
+        if self._leads and all(
+            node.state == "ready" or (node.spare and (not node.here or node.failing_since is not None))
+            for node in self._nodes.values()
+        ):
+            self._pass_barrier()
 
     def _pass_barrier(self) -> None:
         if not self._barrier_passed:
@@ -441,7 +470,12 @@ class Launcher:
 
     def _restart_or_fail(self, node: NodeState, cause: str, how: How, at: object) -> None:
         name, now = node.plan.node, time.monotonic()
+        if node.spare and self._barrier_passed and how is How.LASTING:
+            how = How.FAULT  # it has worked before
         verdict = node.policy.ended(now, at, how)
+        if node.spare and isinstance(verdict, Again):
+            self._go_on_without(node, cause, verdict.delay_s)
+            return
         if not isinstance(verdict, Again):
             node.state = "failed"
             tried = f" after {node.restarts} restarts" if node.restarts else ""
@@ -455,6 +489,24 @@ class Launcher:
         said = f": {node.last_words.error}" if node.last_words else ""
         self._report(name, f"{cause}{said}; {again}")
 
+    def _go_on_without(self, node: NodeState, cause: str, delay_s: float) -> None:
+        """Have a spare node started again some time; say that it is missing, and say it again now and then."""
+        now = time.monotonic()
+        if node.failing_since is None:
+            node.failing_since = node.say_at = now
+        node.restarts += 1
+        node.state = "waiting"
+        node.restart_at = now + delay_s
+        node.last_line = node.last_words.error if node.last_words else cause
+        if now >= node.say_at:
+            node.say_at = now + FAILING_SAID
+            said = f": {node.last_words.error}" if node.last_words else ""
+            self._report(node.plan.node, f"{cause}{said}; THE FLOW GOES ON WITHOUT ITS RECORDING and tries again")
+        if not self._barrier_passed:
+            self._pass_barrier_if_all_are_ready()
+            if self._barrier_passed:
+                self._say_start()
+
     # --- what goes out ----------------------------------------------------------------------------------------
 
     def _start(self, node: NodeState) -> None:
@@ -463,10 +515,15 @@ class Launcher:
         if self._barrier_passed and plan.module == REPLAYER_MODULE:
             settings = {**plan.settings, "started_s": self._started_s}
             plan = msgspec.structs.replace(plan, settings=settings)
+        # What a spare reader misses at the start it asks for: nobody waits for it, as it may never come.
+        absent = tuple(name for name, other in self._nodes.items() if other.spare)
         if self._company is not None:
             folder = str(self._state_folder) if self._state_folder else None
             away = self._company.out_of_reach(plan.readers)
             plan = msgspec.structs.replace(plan, absent=away, state_folder=folder)
+        plan = msgspec.structs.replace(plan, absent=(*plan.absent, *absent), takes_over=node.restarts > 0)
+        if node.restarts and plan.module == RECORDER_MODULE:
+            plan = msgspec.structs.replace(plan, settings={**plan.settings, "goes_on": True})
         plan.write(path)
         node.state, node.last_words = "starting", None
         node.started_at = time.monotonic()
@@ -515,7 +572,7 @@ class Launcher:
         return bool(self._outcome.failures or self._outcome.interrupted or self._over)
 
     def _all_ended(self) -> bool:
-        return self._leads and all(node.handled == END for node in self._nodes.values())
+        return self._leads and all(node.handled == END or node.missing for node in self._nodes.values())
 
     def _stop(self) -> None:
         """End sources and operators, then the sinks, which take what was still on its way."""
@@ -524,6 +581,8 @@ class Launcher:
         killed = self._processes.end(others, STOP_PATIENCE) + self._processes.end(sinks, STOP_PATIENCE - 0.5)
         for name in killed:
             self._report(name, f"did not end within {STOP_PATIENCE:g} s; killed")
+            if self._nodes[name].spare:
+                self._outcome.unrecorded.append(f"{name}: the recording is incomplete: it was killed at the end")
         while not self._events.empty():
             match self._events.get_nowait():
                 case Line(node, text):
@@ -533,6 +592,9 @@ class Launcher:
 
     def _conclude(self) -> None:
         nodes = self._nodes.items()
+        for name, node in nodes:
+            if node.spare and node.here and (node.failing_since is not None or node.last_words is not None):
+                self._outcome.unrecorded.append(f"{name}: the recording is incomplete: {node.last_line}")
         self._outcome.counters = {name: node.counters for name, node in nodes if node.counters is not None}
         if self._deployment.replay and not self._outcome.interrupted:
             failures, self._outcome.failures = self._outcome.failures, []

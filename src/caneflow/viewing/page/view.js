@@ -10,6 +10,7 @@ import { decode } from "./wire.js";
 import { degrees, medianEdge, number, pictureInWords, sentence } from "./words.js";
 
 const MOST_PICTURES = 1200; // range-Doppler maps kept of a running flow: two minutes
+const TROUBLES = { failed: "has failed", waiting: "has ended and is started again" }; // what a node's state means
 const STALE = 1.5; // s without a new position, from which on it is said
 const RETRY = 1000; // ms between two attempts to connect
 const CALM_DRAWING = 500; // ms between two drawings when reduced motion is wanted
@@ -246,7 +247,9 @@ function showTables({ traffic, status, unheard }) {
     ...Object.entries(traffic).map(([name, seen]) => streamRow(name, seen)),
   ]);
   for (const { node, state: now, said } of found.nodes) {
-    if (now === "failed" && state.states[node] !== now) $("trouble").textContent = `${node} has failed: ${said}`;
+    const trouble = TROUBLES[now];
+    if (trouble && state.states[node] !== now) $("trouble").textContent = `${node} ${trouble}: ${said}`;
+    if (now === "ready" && $("trouble").textContent.startsWith(`${node} ${TROUBLES.waiting}`)) $("trouble").textContent = "";
     state.states[node] = now;
   }
   if (unheard) $("trouble").textContent = `The view itself was too slow for ${unheard} samples; the flow lost none.`;
