@@ -253,7 +253,10 @@ def test_a_loop_goes_on_with_stamps_and_numbers(
     assert spacing == {10_000_000}, "the next turn begins one sample after the last"
 
 
-def test_ctrl_c_ends_everything_in_order(live: Path, tmp_path: Path, start: Callable[..., Running]) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_ctrl_c_and_a_lost_terminal_end_everything_in_order(
+    live: Path, tmp_path: Path, start: Callable[..., Running], number: int
+) -> None:
     out = tmp_path / "out.mcap"
     running = start("run", live, "--record", out)
     with running.session() as session:
@@ -261,7 +264,7 @@ def test_ctrl_c_ends_everything_in_order(live: Path, tmp_path: Path, start: Call
     nodes = running.nodes()
     assert len(nodes) == 3
     began = time.monotonic()
-    status, output = running.end(signal.SIGINT)
+    status, output = running.end(number)
     assert status == 130, output
     assert time.monotonic() - began < 5
     assert not any(node.is_running() for node in nodes)
@@ -269,6 +272,63 @@ def test_ctrl_c_ends_everything_in_order(live: Path, tmp_path: Path, start: Call
         assert recording.complete
         counts = {stream: found.count for stream, found in recording.streams.items()}
     assert counts["ticker", "imu"] >= counts["echo", "imu"] > 0
+
+
+def test_under_nohup_a_lost_terminal_ends_nothing(live: Path, tmp_path: Path) -> None:
+    """`nohup` ignores the signal; and nobody reads what the flow says."""
+    out = tmp_path / "out.mcap"
+    command = ["sh", "-c", 'trap "" HUP && exec "$@"', "sh", *CANEFLOW, "run", str(live), "--record", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        assert process.stdout is not None
+        try:
+            wait_for(lambda: len(node_processes(process.pid)) == 3, "all nodes")
+            process.stdout.close()
+            process.send_signal(signal.SIGHUP)
+            node_processes(process.pid)["echo"].kill()  # that is two lines for nobody
+            grown = out.stat().st_size + 5_000
+            wait_for(lambda: out.stat().st_size > grown or process.poll() is not None, "further samples")
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(DEADLINE) == 130
+        finally:
+            process.kill()
+    with Recording(out) as recording:
+        assert recording.complete
+        assert recording.streams["echo", "imu"].count > 0
+
+
+def test_a_run_whose_reader_has_gone_goes_on_to_its_end(cane: Path, walk: Path, tmp_path: Path) -> None:
+    """As in `caneflow run ... 2>&1 | head -1`."""
+    out = tmp_path / "out.mcap"
+    command = [*CANEFLOW, "run", str(cane), "--replay", str(walk), "--speed", "max", "--record", str(out)]
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(command, stdout=writing, stderr=writing, timeout=DEADLINE, check=False)
+    finally:
+        os.close(writing)
+    assert done.returncode == 0
+    with Recording(out) as recording:
+        assert recording.complete
+        assert recording.streams["fusion", "pose"].count == 400
+
+
+def test_what_is_for_its_output_alone_ends_with_its_reader(
+    walk: Path, live: Path, start: Callable[..., Running]
+) -> None:
+    running = start("run", live)
+    with running.session() as session:
+        next(counters(session, running.flow, "echo"))
+    reading, writing = os.pipe()
+    os.close(reading)
+    tools = [
+        subprocess.Popen([*CANEFLOW, *words], stdout=writing, stderr=subprocess.PIPE, text=True)
+        for words in (["info", str(walk)], ["echo", running.flow], ["hz", running.flow])
+    ]
+    os.close(writing)
+    for tool in tools:
+        _, said = tool.communicate(timeout=DEADLINE)
+        assert (tool.returncode, said) == (0, ""), tool.args
+    assert running.end(signal.SIGINT)[0] == 130
 
 
 @pytest.mark.parametrize("wait_for_ready", [True, False])

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import caneflow
-from caneflow import dispatch
+from caneflow import dispatch, standard_streams
 from caneflow.errors import CaneflowError
 
 TOOLS = "caneflow.tools"
@@ -19,6 +19,9 @@ USAGE_STATUS = 2  # exit status of an expected error, as of a misspelt option
 # UsageError, which typer does not name: of click, or of its own copy of click.
 MISUSE = cast(type[Exception], typer.BadParameter.__mro__[1])
 INTERRUPTED_STATUS = 130  # 128 + SIGINT, as a shell reports Ctrl-C
+
+# Words that are for their output alone: without a reader they end. The work of all others goes on.
+OUTPUT_ALONE = frozenset({"echo", "hz", "top", "info"})
 
 # Word -> module in tools, one line of help. A tool has `command`, a function whose annotations are its options, or
 # `commands`, such functions by word. It is imported when its word is used: `caneflow check` needs no matplotlib.
@@ -82,6 +85,7 @@ def program() -> NoReturn:
 
 def main() -> NoReturn:
     """Run the command line's word; exit status 2 and one line for an expected error, a traceback for a bug."""
+    standard_streams.outlive_readers(end=not OUTPUT_ALONE.isdisjoint(sys.argv[1:2]))
     try:
         status = _command().main(prog_name="caneflow", standalone_mode=False)
     except MISUSE as error:

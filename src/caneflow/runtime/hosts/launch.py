@@ -95,7 +95,7 @@ class StatusAsked:
 
 @dataclass(frozen=True)
 class Interrupted:
-    """Ctrl-C or SIGTERM."""
+    """Ctrl-C, SIGTERM or SIGHUP."""
 
 
 @dataclass
@@ -603,8 +603,11 @@ class Launcher:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """Turn Ctrl-C and SIGTERM into an event: everything ends in order."""
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        """Turn Ctrl-C, SIGTERM and SIGHUP (which nohup has ignored) into an event: everything ends in order."""
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
+        before = {number: signal.getsignal(number) for number in numbers}
         for number in before:
             signal.signal(number, lambda *_: self._events.put(Interrupted()))
         try:
