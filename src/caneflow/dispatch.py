@@ -16,12 +16,20 @@ ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 # numpy's names of what it would choose beyond its baseline, as its own module says them (__cpu_dispatch__): other names
 # are ignored with an ImportWarning, a name of the baseline is an error.
-X86_FROM_2_4 = ("X86_V3", "X86_V4", "AVX512_ICL", "AVX512_SPR")
-X86_BEFORE = (
-    *("SSSE3", "SSE41", "POPCNT", "SSE42", "AVX", "F16C", "FMA3", "AVX2", "AVX512F", "AVX512CD"),
-    *("AVX512_KNL", "AVX512_KNM", "AVX512_SKX", "AVX512_CLX", "AVX512_CNL", "AVX512_ICL"),
-)
-ARM = ("ASIMDHP", "ASIMDDP", "ASIMDFHM", "SVE")
+FEATURES = {  # by architecture, then from which numpy on
+    "x86_64": {
+        (2, 4): ("X86_V3", "X86_V4", "AVX512_ICL", "AVX512_SPR"),
+        (0, 0): (
+            *("SSSE3", "SSE41", "POPCNT", "SSE42", "AVX", "F16C", "FMA3", "AVX2", "AVX512F", "AVX512CD"),
+            *("AVX512_KNL", "AVX512_KNM", "AVX512_SKX", "AVX512_CLX", "AVX512_CNL", "AVX512_ICL"),
+        ),
+    },
+    "aarch64": {
+        (2, 4): ("ASIMDHP", "ASIMDDP", "ASIMDFHM", "SVE"),
+        (2, 0): ("ASIMDHP", "ASIMDFHM", "SVE"),
+        (0, 0): ("ASIMDHP", "ASIMDFHM"),
+    },
+}
 
 # The oldest kernels of OpenBLAS that every processor has on which numpy's wheels run; and their name once chosen.
 BLAS_CORES = {"x86_64": "Nehalem", "aarch64": "ARMV8"}
@@ -64,11 +72,8 @@ def pinned() -> tuple[str, ...]:
 
 
 def _numpy_features(machine: str) -> tuple[str, ...]:
-    if machine == "aarch64":
-        return ARM
-    if machine != "x86_64":
-        return ()
-    return X86_FROM_2_4 if _numpy_version() >= (2, 4) else X86_BEFORE
+    installed = _numpy_version()
+    return next((names for since, names in FEATURES.get(machine, {}).items() if installed >= since), ())
 
 
 def _numpy_version() -> tuple[int, int]:

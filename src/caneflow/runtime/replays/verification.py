@@ -18,8 +18,8 @@ from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.plan import InputPlan, NodePlan
 from caneflow.runtime.program import Context, Program, Sink
 
-# On another platform the last digits differ, and filters carry that on. Measured on walks of 53 s, x86-64 against
-# aarch64: Luenberger 2.1e-8 m, `best` 3.3e-7 m, the firmware's model 1.3e-6 m.
+# On another platform the last digits differ, and filters carry that on. Measured on a walk of 54 s, x86-64 against
+# aarch64 (qemu-user): speeds 5.4e-7 m/s, Luenberger 2.7e-8 m, `best` 1.7e-7 m, the firmware's model 9.5e-7 m.
 ACROSS_PLATFORMS = 1e-5  # absolute, in a number's own SI unit
 COMPARISON = "verification.comparison"  # no node of a file has such a name
 
