@@ -98,4 +98,6 @@ def _say(words: LastWords) -> None:
     with suppress(OSError, ValueError):  # the launcher is gone
         sys.stdout.flush()
         sys.stderr.flush()
-        os.write(sys.stderr.fileno(), f"{MARK}{msgspec.json.encode(words).decode()}\n".encode())
+        by_hand = sys.stderr.isatty()  # and not by a launcher
+        text = "\n".join(words.lines) if by_hand else f"{MARK}{msgspec.json.encode(words).decode()}"
+        os.write(sys.stderr.fileno(), f"{text}\n".encode())
