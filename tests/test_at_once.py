@@ -179,11 +179,11 @@ def test_no_sample_waits_for_the_disk_that_a_snapshot_goes_to(made: Any, clock: 
     def bring() -> None:
         taken.append(host.take_at_once(arrival(1)))
 
-    def keep_slowly(snapshot: bytes) -> None:
+    def keep_slowly(snapshot: bytes) -> bool:
         bringing = threading.Thread(target=bring)
         bringing.start()
         bringing.join(30)
-        keep(snapshot)
+        return bool(keep(snapshot))
 
     host.keeper.keep = keep_slowly
     host.keep_snapshot()

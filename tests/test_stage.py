@@ -14,6 +14,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.stages.merge import END
 from caneflow.runtime.stages.stage import Stage
+from caneflow.runtime.stages.streams import SILENCE
 
 
 class Echo(Operator):
@@ -247,3 +248,74 @@ def test_an_older_mark_does_not_replace_the_one_that_waits() -> None:
     host.offer("a", imu(20, 1))
     emitted(host)
     assert host.finished
+
+
+def resumed() -> Stage:
+    """A stage that goes on from the state of another one, which handled two samples of `a` and none of `b`."""
+    before, after = stage(), stage()
+    before.mark("b", PortMark(-1, 20))
+    before.offer("a", imu(10, 0))
+    before.offer("a", imu(20, 1))
+    assert emitted(before) == [(10, 0), (20, 1)]
+    after.resume(before.state(), Echo())
+    return after
+
+
+def test_after_a_resume_time_does_not_go_back(caplog: pytest.LogCaptureFixture) -> None:
+    host = resumed()
+    host.close("b")
+    host.offer("a", imu(20, 2))  # the next number, and a stamp that was handled before
+    host.offer("a", imu(15, 3))
+    assert "seq 2 has stamp 20, after 20" in caplog.text
+    host.offer("a", imu(30, 4))
+    assert emitted(host) == [(30, 2)]
+    counts = host.input_counts()["a"]
+    assert (counts.received, counts.handled, counts.refused, counts.late, counts.lost) == (3, 1, 2, 0, 0)
+
+
+def test_after_a_resume_what_was_handled_before_is_known_as_such() -> None:
+    host = resumed()
+    host.close("b")
+    host.offer("a", imu(20, 1), again=True)
+    host.offer("a", imu(20, 1))
+    host.offer("a", imu(30, 2))
+    assert emitted(host) == [(30, 2)]
+    counts = host.input_counts()["a"]
+    assert (counts.received, counts.repeated, counts.late, counts.lost) == (2, 1, 0, 0)
+
+
+def test_after_a_resume_the_silence_before_the_next_sample_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    host = resumed()
+    host.offer("a", imu(20 + 3 * SILENCE, 2))
+    assert "nothing for 3.00 s before seq 2" in caplog.text
+
+
+def test_after_a_resume_outputs_go_on_in_number_and_time() -> None:
+    host = resumed()
+    host.close("b")
+    assert host.outputs["speed"].number(speed(30, 0.0)) == 2
+    with pytest.raises(DataflowError, match="stamp 25 after 30"):
+        host.outputs["speed"].number(speed(25, 0.0))
+    with pytest.raises(DataflowError, match="stamp 20 after 20"):
+        resumed().outputs["speed"].number(speed(20, 0.0))
+
+
+def test_after_a_resume_an_input_that_had_nothing_yet_begins_with_its_first_sample() -> None:
+    host = resumed()
+    host.offer("b", imu(5, 0))
+    assert emitted(host) == []
+    assert host.input_counts()["b"].handled == 1, "the other one is known to have passed it"
+    host.offer("a", imu(30, 2))
+    host.offer("b", imu(30, 1))
+    assert emitted(host) == [(30, 2)]
+    assert host.input_counts()["b"].lost == 0
+
+
+def test_a_finished_stage_stays_finished() -> None:
+    before, after = stage(), stage()
+    for port in ("a", "b"):
+        before.close(port)
+    assert emitted(before) == [(END - 1, 0)]
+    after.resume(before.state(), Echo())
+    assert emitted(after) == []
+    assert after.finished

@@ -46,10 +46,12 @@ from caneflow.runtime.program import Context, Operator, Program, Quiet, Sink, So
 from caneflow.runtime.stages.feed import Feed
 from caneflow.runtime.stages.history import History
 from caneflow.runtime.stages.merge import BEGIN, END
+from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.seeds import generator
 from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
 from caneflow.runtime.stages.stage import Stage
 from caneflow.runtime.stages.tap import Tap
+from caneflow.runtime.wording import one_line
 
 log = logging.getLogger(__name__)
 
@@ -375,6 +377,13 @@ class _OperatorNode(_ReaderNode):
 
     def run(self) -> None:
         resumed = self.resume()
+        try:
+            self.handle_all(resumed=resumed)
+        except Exception:
+            self.keeper.note_failure()
+            raise
+
+    def handle_all(self, *, resumed: bool) -> None:
         self.bus.at_once = self.take_at_once
         self.bus.declare_ready()
         if resumed:
@@ -490,17 +499,34 @@ class _OperatorNode(_ReaderNode):
             handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
             fresh = handled != self.confirmed
             snapshot = self.keeper.taken(self.stage.state(), self.history.kept()) if fresh else None
-        if snapshot is not None:
-            self.keeper.keep(snapshot)  # live without the lock: samples do not wait for the disk
-        self.confirmed = handled
+        if not fresh or self.is_kept(snapshot):  # live without the lock: samples do not wait for the disk
+            self.confirmed = handled
         self._next_snapshot = time.monotonic() + self._snapshot_period
 
+    def is_kept(self, snapshot: bytes | None) -> bool:
+        """Keep a snapshot, or None for a state that cannot be kept; whether writers may forget what it has handled.
+
+        They may when a process in this one's place would not ask for it. So while no snapshot can be written they keep
+        what came since the last one, up to the bound of their histories. A replay without any snapshot begins again
+        with its first sample; a live operator with what is new, since old samples would only make it late.
+        """
+        if snapshot is not None:
+            return self.keeper.keep(snapshot)
+        if not self.plan.replay:
+            self.keeper.discard()
+        return not self.plan.replay
+
     def resume(self) -> bool:
-        """Go on where a process before this one was killed; whether there was one."""
-        kept = self.keeper.resume()
-        if kept is None:
+        """Go on where a process before this one was killed; whether there was one, and its snapshot fits."""
+        try:
+            kept = self.keeper.resume()
+            if kept is None:
+                return False
+            self.stage.resume(kept.stage, kept.operator)
+        except SnapshotError as error:
+            log.warning("starts without its snapshot, which cannot be used: %s", one_line(error))
             return False
-        self.stage.resume(kept.stage)
+        self.keeper.go_on_with(kept.operator)
         for port, samples in kept.history.items():
             for seq, payload in samples:
                 self.history.keep(port, seq, payload)

@@ -1,146 +1,260 @@
-"""An operator's whole state as msgpack, and back: exact to the last bit, no pickle, no code from outside.
+"""An operator's whole state as msgpack, and back: exact to the last bit or refused; data, never code.
 
 An object is its class's name and its attributes; arrays that share memory, objects that are referred to twice and
-random generators stay what they are. Classes are looked up in caneflow and in the operator's own module only, and
-nothing of theirs is called on the way back but for messages, which check themselves. So any operator that holds plain
-data can be brought back after a kill; for one that holds an open file or an iterator SnapshotError names the attribute.
+random generators stay what they are. Any operator that holds plain data can be brought back after a kill; for one that
+holds an open file or an iterator SnapshotError names the attribute. What is not in an attribute, e.g. a variable of
+the module, is not kept.
+
+On the way back objects are made empty and given their attributes: nothing of theirs is called, but messages and other
+`msgspec.Struct`s check themselves. What may be named at all: see `references`.
 """
 
 import enum
-import importlib
-import sys
-from collections import deque
-from collections.abc import Callable, Collection
-from types import BuiltinFunctionType, FunctionType, MethodType
-from typing import Any
+from collections import Counter, OrderedDict, defaultdict, deque
+from collections.abc import Callable, Collection, Iterator
+from itertools import permutations
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
 
-from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.stages.numpy_state import (
+    BIT_GENERATORS,
+    LARGEST_POOL,
+    array_from_data,
+    array_to_data,
+    bits_from_data,
+    dtype_from_data,
+    dtype_to_data,
+    generator_from_data,
+    scalar_from_data,
+    scalar_to_data,
+    seeds_from_data,
+    view_from_data,
+    view_to_data,
+    whole_of,
+)
+from caneflow.runtime.stages.references import (
+    SnapshotError,
+    attributes_of,
+    bound_method,
+    empty,
+    references_of,
+    require_key,
+    set_attributes,
+)
+
+__all__ = ["SnapshotError", "pack", "unpack"]
 
 INT64 = range(-(2**63), 2**63)
-PLAIN = (type(None), bool, float, str, bytes)
-JUST_PLAIN = frozenset(PLAIN)
-PLAIN_OR_INT = JUST_PLAIN | {int}
-OWN_PACKAGE = "caneflow."
-KEEPABLE = "only plain data and caneflow's classes can be kept"
-FOREIGN = ("builtins", "math", "numpy")  # whose types and functions may be referred to, by name
+PLAIN = frozenset((type(None), bool, float, bytes))
+PLAIN_OR_INT = PLAIN | {int}
+NUMBERS = (bool, int, float, complex, np.number, np.bool_)
+DEEPEST = 100  # levels of things in things; beyond, Python's own limit might end a node
+TABLES: dict[str, type[dict[Any, Any]]] = {kind.__name__: kind for kind in (dict, OrderedDict, Counter)}
+NAMED = (type, FunctionType, BuiltinFunctionType, MethodType, np.ufunc)
+RANDOM = (np.random.Generator, np.random.BitGenerator, np.random.SeedSequence)
 
-
-class SnapshotError(DataflowError):
-    """State that cannot be kept, or a snapshot that does not fit: names the attribute."""
+_Way: TypeAlias = Callable[[Any, str], list[Any]]
 
 
 def pack(state: object, own_module: str) -> bytes:
-    """`state` as msgpack; classes may be from caneflow and from `own_module`. Raises SnapshotError."""
-    return msgspec.msgpack.encode(_Packer(own_module).packed(state, "state"))
+    """`state` as msgpack; its classes are of `own_module` or of caneflow. Raises SnapshotError."""
+    try:
+        return msgspec.msgpack.encode(_Packer(own_module).packed(state, "state"))
+    except SnapshotError:
+        raise
+    except Exception as error:  # a snapshot is a luxury: no attribute, whatever it is, may end the operator
+        raise SnapshotError(f"state cannot be kept: {type(error).__name__}: {error}") from error
 
 
 def unpack(snapshot: bytes, own_module: str) -> Any:
-    """The state in `snapshot`; raises SnapshotError when it does not fit what is installed."""
+    """The state in `snapshot`; raises SnapshotError when it does not fit what is imported here."""
     try:
-        return _Unpacker(own_module).unpacked(msgspec.msgpack.decode(snapshot))
-    except (msgspec.MsgspecError, LookupError, TypeError, ValueError, AttributeError) as error:
-        raise SnapshotError(f"a snapshot that does not fit: {error}") from error
+        return _Unpacker(own_module).whole(msgspec.msgpack.decode(snapshot))
+    except SnapshotError:
+        raise
+    except Exception as error:  # the bytes may be damaged, or made by somebody
+        raise SnapshotError(f"it does not fit: {type(error).__name__}: {error}") from error
 
 
 class _Packer:
     """Turns a graph of objects into nested lists: a tag, then what it takes."""
 
     def __init__(self, own_module: str) -> None:
-        self._own_module = own_module
+        self._references = references_of(own_module)
         self._numbers: dict[int, int] = {}  # id of an object -> its number in the snapshot
         self._alive: list[object] = []  # ids are unique only while their objects live
+        self._unfinished: set[int] = set()  # numbers of what is made after all that it holds
+        self._ways: dict[type, _Way] = {}  # by type: each is looked for once
+        self._depth = 0
 
     def packed(self, value: Any, path: str) -> Any:
-        if isinstance(value, PLAIN) and type(value) in PLAIN:
+        kind = type(value)
+        if kind in PLAIN:
             return value
-        if type(value) is int:
-            return value if value in INT64 else ["int", str(value)]
-        if type(value) is tuple:
-            return ["tuple", None, self._items(value, path)]
-        if type(value) is complex:
+        if kind is int:
+            return value if value in INT64 else ["int", _bytes_of(value)]
+        if kind is str:
+            return value if value.isascii() else _text(value)
+        if kind is tuple:
+            return ["tuple", self._items(value, path)]
+        if kind is complex:
             return ["complex", value.real, value.imag]
-        if isinstance(value, np.generic):
-            return ["scalar", value.dtype.str, value.tobytes()]
-        if id(value) in self._numbers:
-            return ["again", self._numbers[id(value)]]
-        return self._new(value, path)
+        number = self._numbers.get(id(value))
+        if number is None:
+            way = self._ways.get(kind)
+            if way is None:
+                way = self._ways[kind] = self._way(kind)
+            return way(value, path)
+        if number in self._unfinished:
+            raise SnapshotError(f"{path} is a {kind.__name__} that holds itself; it cannot be kept")
+        return ["again", number]
 
-    def _new(self, value: Any, path: str) -> Any:
-        if isinstance(value, (type, np.dtype, enum.Enum)) or _is_function(value):
-            return self._named(value, path)
-        if isinstance(value, tuple):
-            return ["tuple", self._class_name(value, path), self._items(value, path)]
-        if isinstance(value, np.ndarray) and isinstance(value.base, np.ndarray):
-            return self._view(value, path)  # its base comes first, under a number of its own
+    def _way(self, kind: type) -> _Way:
+        """How values of the type `kind` are packed."""
+        for kinds, way in (
+            (np.generic, self._scalar),
+            (enum.Enum, self._member),
+            (NAMED, self._name),
+            (np.dtype, self._dtype),
+            (np.ndarray, self._array),
+            ((tuple, frozenset, msgspec.Struct), self._closed),
+            (RANDOM, self._random),
+        ):
+            if issubclass(kind, kinds):
+                return way
+        own: dict[type, _Way] = {list: self._list, deque: self._deque, set: self._set, defaultdict: self._table}
+        return self._table if kind in TABLES.values() else own.get(kind, self._object)
+
+    def _scalar(self, value: Any, path: str) -> list[Any]:
+        return ["scalar", *scalar_to_data(value, path)]
+
+    def _member(self, value: Any, path: str) -> list[Any]:
+        name = self._references.class_name(type(value), path)
+        if vars(type(value))["_member_map_"].get(value._name_) is not value:  # several flags at once
+            raise SnapshotError(f"{path} is {value!r}, which has no name of its own; it cannot be kept")
+        return ["member", name, value._name_]
+
+    def _dtype(self, value: Any, path: str) -> list[Any]:
+        return ["dtype", dtype_to_data(value, path)]
+
+    def _name(self, value: Any, path: str) -> list[Any]:
+        """A class or function by its name, and the object that it is bound to, if it is."""
+        owner = None if isinstance(value, type) else getattr(value, "__self__", None)
+        if owner is None or isinstance(owner, ModuleType):
+            return ["name", self._references.name(value, path)]
+        if bound_method(owner, value.__name__) != value:
+            raise SnapshotError(f"{path} is a method {value.__name__} that its object does not have; it cannot be kept")
+        return ["method", self.packed(owner, f"{path}.__self__"), value.__name__]
+
+    def _list(self, value: Any, path: str) -> list[Any]:
+        return ["list", self._remember(value), self._items(value, path)]
+
+    def _deque(self, value: Any, path: str) -> list[Any]:
+        return ["deque", self._remember(value), value.maxlen, self._items(value, path)]
+
+    def _set(self, value: Any, path: str) -> list[Any]:
+        return ["set", self._remember(value), self._elements(value, path)]
+
+    def _object(self, value: Any, path: str) -> list[Any]:
+        name = self._references.class_name(type(value), path)
+        return ["object", self._remember(value), name, self._attributes(attributes_of(value, path), path)]
+
+    def _closed(self, value: Any, path: str) -> list[Any]:
+        """What cannot be changed once it is made, so that all that it holds is made before."""
+        kind, number = type(value), self._remember(value)
+        self._unfinished.add(number)
+        if kind is frozenset:
+            packed = ["frozenset", number, self._elements(value, path)]
+        else:
+            name = self._references.class_name(kind, path)
+            if kind.__dictoffset__ and vars(value):
+                raise SnapshotError(f"{path} is a {kind.__name__} with more attributes; it cannot be kept")
+            if isinstance(value, tuple):
+                packed = ["named tuple", number, name, self._items(value, path)]
+            else:
+                fields = {field: getattr(value, field) for field in value.__struct_fields__}
+                packed = ["struct", number, name, self._attributes(fields, path)]
+        self._unfinished.remove(number)
+        return packed
+
+    def _array(self, value: Any, path: str) -> list[Any]:
+        writes = value.flags.writeable
+        if isinstance(value.base, np.ndarray):
+            whole = whole_of(value)
+            packed = self.packed(whole, f"{path}.base")  # comes first, under a number of its own
+            return ["view", self._remember(value), writes, packed, *view_to_data(value, whole, path)]
+        return ["array", self._remember(value), writes, *array_to_data(value, path)]
+
+    def _table(self, value: dict[Any, Any], path: str) -> list[Any]:
         number = self._remember(value)
-        if isinstance(value, np.ndarray):
-            return ["array", number, *_array(value, path)]
-        if type(value) is list:
-            return ["list", number, self._items(value, path)]
-        if type(value) in (set, frozenset):
-            items = [self.packed(item, path) for item in sorted(value, key=repr)]
-            return ["set", number, type(value) is frozenset, items]
-        if type(value) is deque:
-            return ["deque", number, value.maxlen, self._items(value, path)]
-        if type(value) is dict:
-            return ["dict", number, self._pairs(value, path)]
-        if isinstance(value, np.random.Generator):
-            kind = type(value.bit_generator).__name__
-            return ["generator", number, kind, self.packed(value.bit_generator.state, f"{path}.state")]
-        if isinstance(value, msgspec.Struct):
-            fields = {name: getattr(value, name) for name in value.__struct_fields__}
-            return ["struct", number, self._class_name(value, path), self._pairs(fields, path)]
-        if type(value).__module__ in FOREIGN:  # an iterator, an open file: no plain data
-            raise SnapshotError(
-                f"{path} is a {type(value).__name__}; only plain data and caneflow's classes can be kept"
-            )
-        return ["object", number, self._class_name(value, path), self._pairs(_attributes(value), path)]
+        if getattr(value, "__dict__", None):
+            raise SnapshotError(f"{path} is a {type(value).__name__} with attributes; it cannot be kept")
+        factory = self.packed(getattr(value, "default_factory", None), f"{path}.default_factory")
+        self._enter(path)
+        pairs: list[Any] = []
+        for key, item in value.items():
+            require_key(key, path)
+            pairs += (self.packed(key, path), self.packed(item, f"{path}.{key}"))
+        self._depth -= 1
+        if type(value) is defaultdict:
+            return ["default table", number, factory, pairs]
+        return ["table", number, type(value).__name__, pairs]
+
+    def _elements(self, value: "set[Any] | frozenset[Any]", path: str) -> list[Any]:
+        """The elements of a set, such that a new one of them has the same order."""
+        for item in value:
+            require_key(item, path)
+        items = list(value)
+        if not all(map(_is_numbers, items)):
+            return self._items(items, path)  # the order of text is another one in each process
+        # The order in which they are put in decides, where two want the same place.
+        orders = permutations(items) if len(items) < 6 else (items, items[::-1], sorted(items, key=repr))
+        for order in orders:
+            if all(a is b for a, b in zip(set(order), items, strict=True)):
+                return self._items(order, path)
+        raise SnapshotError(f"{path} is a set whose order cannot be kept; a dict keeps its order")
+
+    def _random(self, value: Any, path: str) -> list[Any]:
+        number = self._remember(value)
+        if type(value) is np.random.Generator:
+            return ["generator", number, self.packed(value.bit_generator, f"{path}.bit_generator")]
+        if type(value) is np.random.SeedSequence and value.pool_size <= LARGEST_POOL:
+            entropy, spawn_key = (self.packed(each, path) for each in (value.entropy, value.spawn_key))
+            return ["seeds", number, entropy, spawn_key, value.pool_size, value.n_children_spawned]
+        name = type(value).__name__
+        if BIT_GENERATORS.get(name) is not type(value) or type(value.seed_seq) is not np.random.SeedSequence:
+            raise SnapshotError(f"{path} is a {name}; of random generators only numpy's own can be kept")
+        seeds = self.packed(value.seed_seq, f"{path}.seed_seq")
+        return ["bits", number, name, self.packed(value.state, f"{path}.state"), seeds]
 
     def _items(self, values: Collection[Any], path: str) -> list[Any]:
         kinds = set(map(type, values))
-        if kinds <= JUST_PLAIN:  # most are, and there are many
+        if kinds <= PLAIN:  # most are, and there are many
             return list(values)
         if kinds <= PLAIN_OR_INT and all(item in INT64 for item in values if type(item) is int):
             return list(values)
-        return [self.packed(item, f"{path}[{i}]") for i, item in enumerate(values)]
+        self._enter(path)
+        packed = [self.packed(item, f"{path}[{i}]") for i, item in enumerate(values)]
+        self._depth -= 1
+        return packed
 
-    def _pairs(self, values: dict[Any, Any], path: str) -> list[Any]:
-        return [[self.packed(key, path), self.packed(item, f"{path}.{key}")] for key, item in values.items()]
+    def _attributes(self, values: dict[str, Any], path: str) -> list[Any]:
+        self._enter(path)
+        pairs: list[Any] = []
+        for name, value in values.items():
+            if type(name) is not str:
+                raise SnapshotError(f"{path} has the attribute {name!r}, which is not a name; it cannot be kept")
+            pairs += (name, self.packed(value, f"{path}.{name}"))
+        self._depth -= 1
+        return pairs
 
-    def _view(self, value: "np.ndarray[Any, Any]", path: str) -> Any:
-        base = value
-        while isinstance(base.base, np.ndarray):
-            base = base.base
-        if base.base is not None:  # memory that belongs to something else, e.g. a sample's bytes: keep the elements
-            return ["array", self._remember(value), *_array(value, path)]
-        packed = self.packed(base, f"{path}.base")
-        offset = value.__array_interface__["data"][0] - base.__array_interface__["data"][0]
-        writes = value.flags.writeable
-        about = [offset, list(value.shape), list(value.strides), writes]
-        return ["view", self._remember(value), packed, value.dtype.str, *about]
-
-    def _named(self, value: Any, path: str) -> Any:
-        if isinstance(value, np.dtype):
-            return ["dtype", value.str]
-        if isinstance(value, enum.Enum):
-            return ["member", self._class_name(value, path), value.name]
-        owner = getattr(value, "__self__", None)
-        if owner is not None and not isinstance(owner, type(sys)):  # a method of an object
-            return ["method", self.packed(owner, path), value.__name__]
-        return ["name", self._allowed(value.__module__, value.__qualname__, path)]
-
-    def _class_name(self, value: object, path: str) -> str:
-        kind = type(value)
-        return self._allowed(kind.__module__, kind.__qualname__, path)
-
-    def _allowed(self, module: str, name: str, path: str) -> str:
-        known = module == self._own_module or module.startswith(OWN_PACKAGE) or module in FOREIGN
-        if not known or "<" in name:
-            raise SnapshotError(f"{path} is a {module}.{name}; {KEEPABLE}")
-        return f"{module}:{name}"
+    def _enter(self, path: str) -> None:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise SnapshotError(f"{path[:40]}... is nested more than {DEEPEST} levels deep; it cannot be kept")
 
     def _remember(self, value: object) -> int:
         self._alive.append(value)
@@ -151,128 +265,165 @@ class _Unpacker:
     """Turns nested lists back into the graph of objects."""
 
     def __init__(self, own_module: str) -> None:
-        self._own_module = own_module
+        self._references = references_of(own_module)
         self._made: dict[int, Any] = {}
+        self._constant: list[Any] = []  # arrays that must not be written to once all is there
+        self._makers: dict[str, Callable[..., Any]] = {
+            "again": self._made.__getitem__,
+            "array": self._array,
+            "bits": self._bits,
+            "complex": complex,
+            "default table": self._default_table,
+            "deque": self._deque,
+            "dtype": dtype_from_data,
+            "frozenset": self._frozenset,
+            "generator": self._generator,
+            "int": _int,
+            "list": self._list,
+            "member": self._member,
+            "method": self._method,
+            "name": self._references.found,
+            "named tuple": self._named_tuple,
+            "object": self._object,
+            "scalar": scalar_from_data,
+            "seeds": self._seeds,
+            "set": self._set,
+            "struct": self._struct,
+            "table": self._table,
+            "text": _text_from,
+            "tuple": self._tuple,
+            "view": self._view,
+        }
 
-    def unpacked(self, packed: Any) -> Any:
-        if not isinstance(packed, list):
-            return packed
-        make: Callable[..., Any] = getattr(self, f"_{packed[0]}")
-        return make(*packed[1:])
+    def whole(self, packed: Any) -> Any:
+        made = self._unpacked(packed)
+        for array in self._constant:
+            array.flags.writeable = False
+        return made
+
+    def _unpacked(self, packed: Any) -> Any:
+        return self._makers[packed[0]](*packed[1:]) if isinstance(packed, list) else packed
 
     def _keep(self, number: int, value: Any) -> Any:
         self._made[number] = value
         return value
 
-    def _int(self, digits: str) -> int:
-        return int(digits)
+    def _tuple(self, items: list[Any]) -> Any:
+        return tuple(map(self._unpacked, items))
 
-    def _complex(self, real: float, imaginary: float) -> complex:
-        return complex(real, imaginary)
+    def _named_tuple(self, number: int, name: str, items: list[Any]) -> Any:
+        kind = self._references.found_class(name, tuple)
+        if len(items) != len(vars(kind).get("_fields", items)):
+            raise SnapshotError(f"it holds {len(items)} values for {name}")
+        return self._keep(number, tuple.__new__(kind, map(self._unpacked, items)))
 
-    def _scalar(self, dtype: str, data: bytes) -> Any:
-        return np.frombuffer(data, dtype)[0]
+    def _array(self, number: int, writes: bool, *about: Any) -> Any:
+        return self._keep_array(number, array_from_data(*about), writes)
 
-    def _again(self, number: int) -> Any:
-        return self._made[number]
+    def _view(self, number: int, writes: bool, packed: Any, *about: Any) -> Any:
+        return self._keep_array(number, view_from_data(self._unpacked(packed), *about), writes)
 
-    def _tuple(self, name: str | None, items: list[Any]) -> Any:
-        values = tuple(map(self.unpacked, items))
-        return values if name is None else tuple.__new__(self._found(name), values)
-
-    def _array(self, number: int, dtype: str, shape: list[int], order: str, data: bytes) -> Any:
-        flat = np.frombuffer(bytearray(data), dtype)
-        array = np.empty(shape, dtype, order="F" if order == "F" else "C")  # owns its memory, as it did
-        array[...] = flat.reshape(shape)
+    def _keep_array(self, number: int, array: Any, writes: bool) -> Any:
+        if not writes:
+            self._constant.append(array)
         return self._keep(number, array)
-
-    def _view(
-        self, number: int, base: Any, dtype: str, offset: int, shape: list[int], strides: list[int], writes: bool
-    ) -> Any:
-        whole = self.unpacked(base)
-        view: np.ndarray[Any, Any] = np.ndarray(tuple(shape), dtype, whole, offset, tuple(strides))
-        view.flags.writeable = writes
-        return self._keep(number, view)
 
     def _list(self, number: int, items: list[Any]) -> Any:
         made: list[Any] = self._keep(number, [])
-        made.extend(map(self.unpacked, items))
+        made.extend(map(self._unpacked, items))
         return made
-
-    def _set(self, number: int, frozen: bool, items: list[Any]) -> Any:
-        return self._keep(number, (frozenset if frozen else set)(map(self.unpacked, items)))
 
     def _deque(self, number: int, longest: int | None, items: list[Any]) -> Any:
         made: deque[Any] = self._keep(number, deque(maxlen=longest))
-        made.extend(map(self.unpacked, items))
+        made.extend(map(self._unpacked, items))
         return made
 
-    def _dict(self, number: int, pairs: list[Any]) -> Any:
-        made: dict[Any, Any] = self._keep(number, {})
-        made.update(self._values(pairs))
+    def _set(self, number: int, items: list[Any]) -> Any:
+        made: set[Any] = self._keep(number, set())
+        made.update(list(map(self._key, items)))
         return made
 
-    def _generator(self, number: int, kind: str, state: Any) -> Any:
-        bits = getattr(np.random, kind)()
-        bits.state = self.unpacked(state)
-        return self._keep(number, np.random.Generator(bits))
+    def _frozenset(self, number: int, items: list[Any]) -> Any:
+        return self._keep(number, frozenset(list(map(self._key, items))))
+
+    def _table(self, number: int, name: str, pairs: list[Any]) -> Any:
+        return self._filled(self._keep(number, TABLES[name]()), pairs)
+
+    def _default_table(self, number: int, factory: Any, pairs: list[Any]) -> Any:
+        return self._filled(self._keep(number, defaultdict(self._unpacked(factory))), pairs)
+
+    def _filled(self, made: Any, pairs: list[Any]) -> Any:
+        for key, value in _by_two(pairs):
+            made[self._key(key)] = self._unpacked(value)
+        return made
+
+    def _key(self, packed: Any) -> Any:
+        key = self._unpacked(packed)
+        require_key(key, "it")
+        return key
+
+    def _seeds(self, number: int, entropy: Any, spawn_key: Any, pool_size: int, spawned: int) -> Any:
+        return self._keep(
+            number, seeds_from_data(self._unpacked(entropy), self._unpacked(spawn_key), pool_size, spawned)
+        )
+
+    def _bits(self, number: int, name: str, state: Any, seeds: Any) -> Any:
+        return self._keep(number, bits_from_data(name, self._unpacked(state), self._unpacked(seeds)))
+
+    def _generator(self, number: int, bits: Any) -> Any:
+        return self._keep(number, generator_from_data(self._unpacked(bits)))
 
     def _struct(self, number: int, name: str, pairs: list[Any]) -> Any:
-        return self._keep(number, self._found(name)(**self._values(pairs)))
-
-    def _object(self, number: int, name: str, pairs: list[Any]) -> Any:
-        kind = self._found(name)
-        made = self._keep(number, object.__new__(kind))
-        for attribute, value in self._values(pairs).items():
-            object.__setattr__(made, attribute, value)  # a frozen dataclass is set up this way as well
+        kind = self._references.found_class(name, msgspec.Struct)
+        fields = self._values(pairs)
+        if fields.keys() != set(kind.__struct_fields__):
+            raise SnapshotError(f"it holds {name} with the fields {', '.join(fields)}")
+        made = self._keep(number, kind(**fields))
+        for field, value in fields.items():
+            msgspec.structs.force_setattr(made, field, value)  # should its own check have changed it
         return made
 
-    def _dtype(self, text: str) -> Any:
-        return np.dtype(text)
+    def _object(self, number: int, name: str, pairs: list[Any]) -> Any:
+        made = self._keep(number, empty(self._references.found_class(name)))
+        set_attributes(made, self._values(pairs))
+        return made
 
     def _member(self, name: str, member: str) -> Any:
-        return self._found(name)[member]
+        return vars(self._references.found_class(name, enum.Enum))["_member_map_"][member]
 
     def _method(self, owner: Any, name: str) -> Any:
-        return getattr(self.unpacked(owner), name)
+        method = bound_method(self._unpacked(owner), name)
+        if method is None:
+            raise SnapshotError(f"it names a method {name} that its object does not have")
+        return method
 
-    def _name(self, name: str) -> Any:
-        return self._found(name)
-
-    def _values(self, pairs: list[Any]) -> dict[Any, Any]:
-        return {self.unpacked(key): self.unpacked(value) for key, value in pairs}
-
-    def _found(self, name: str) -> Any:
-        module, _, qualified = name.partition(":")
-        if module.startswith(OWN_PACKAGE):
-            importlib.import_module(module)
-        elif module not in (self._own_module, *FOREIGN):
-            raise SnapshotError(f"a snapshot names {name}; only caneflow's and the operator's own classes are taken")
-        found: Any = sys.modules[module]
-        for part in qualified.split("."):
-            found = getattr(found, part)
-        if module == "builtins" and not isinstance(found, type):
-            raise SnapshotError(f"a snapshot names {name}; of Python itself only types are taken")
-        return found
+    def _values(self, pairs: list[Any]) -> dict[str, Any]:
+        return {name: self._unpacked(value) for name, value in _by_two(pairs)}
 
 
-def _is_function(value: object) -> bool:
-    return isinstance(value, (FunctionType, MethodType, BuiltinFunctionType, np.ufunc))
+def _by_two(pairs: list[Any]) -> Iterator[tuple[Any, Any]]:
+    each = iter(pairs)
+    return zip(each, each, strict=True)
 
 
-def _array(value: "np.ndarray[Any, Any]", path: str) -> list[Any]:
-    if value.dtype.hasobject:
-        raise SnapshotError(f"{path} is an array of objects; it cannot be kept")
-    order = "F" if value.flags.f_contiguous and not value.flags.c_contiguous else "C"
-    return [value.dtype.str, list(value.shape), order, value.tobytes()]
+def _bytes_of(value: int) -> bytes:
+    return value.to_bytes(value.bit_length() // 8 + 1, "little", signed=True)
 
 
-def _attributes(value: object) -> dict[str, Any]:
-    """What an object holds, in its dictionary and its slots."""
-    held = dict(getattr(value, "__dict__", {}))
-    for kind in type(value).__mro__:
-        slots = kind.__dict__.get("__slots__", ())
-        for name in (slots,) if isinstance(slots, str) else slots:
-            if name not in ("__dict__", "__weakref__") and hasattr(value, name):
-                held[name] = getattr(value, name)
-    return held
+def _int(data: bytes) -> int:
+    return int.from_bytes(data, "little", signed=True)
+
+
+def _text(value: str) -> Any:
+    """`value`, or its bytes when msgpack does not take it: half of a surrogate pair, as names of files may have."""
+    data = value.encode("utf-8", "surrogatepass")
+    return value if data.decode("utf-8", "replace") == value else ["text", data]
+
+
+def _text_from(data: bytes) -> str:
+    return data.decode("utf-8", "surrogatepass")
+
+
+def _is_numbers(value: object) -> bool:
+    """Whether the hash of `value` is the same in every process: with text in it, it is not."""
+    return isinstance(value, NUMBERS) or (isinstance(value, tuple) and all(map(_is_numbers, value)))

@@ -5,8 +5,10 @@ emits is numbered. Nothing here knows Zenoh, processes or a clock.
 """
 
 from collections.abc import Mapping
+from typing import Annotated, TypeAlias
 
 import msgspec
+from msgspec import Meta
 
 from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, LeftOut, PortMark, Progress
@@ -14,14 +16,18 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.program import Operator, Refused
 from caneflow.runtime.stages.merge import END, Merge
+from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.streams import Arrivals, Departures
+from caneflow.runtime.wording import listed
+
+Number: TypeAlias = Annotated[int, Meta(ge=-1, le=END)]  # -1: none yet
 
 
 class StageState(msgspec.Struct, frozen=True):
     """Where the streams of a stage stand."""
 
-    inputs: dict[str, tuple[int, int]]  # by port the seq and stamp (ns) of the last sample handled
-    outputs: dict[str, tuple[int, int]]  # by port how many were sent, and the last one's stamp (ns)
+    inputs: dict[str, tuple[Number, Number]]  # by port the seq and stamp (ns) of the last sample handled
+    outputs: dict[str, tuple[Number, Number]]  # by port how many were sent, and the last one's stamp (ns)
     finished: bool
 
 
@@ -117,8 +123,15 @@ class Stage:
             finished=self.finished,
         )
 
-    def resume(self, state: StageState) -> None:
-        """Go on where `state` was taken; what had come and was not handled has to come again."""
+    def resume(self, state: StageState, operator: Operator) -> None:
+        """Go on where `state` was taken, with the operator of then; what was not handled has to come again.
+
+        Raises SnapshotError, with nothing changed, when the state is one of other ports.
+        """
+        for what, ports, found in (("inputs", self.inputs, state.inputs), ("outputs", self.outputs, state.outputs)):
+            if ports.keys() != found.keys():
+                raise SnapshotError(f"it has the {what} {listed(found)}; expected {listed(ports)}")
+        self._operator = operator
         for port, (seq, stamp) in state.inputs.items():
             arrivals = self.inputs[port]
             arrivals.handled_seq, arrivals.handled_stamp = seq, stamp
