@@ -31,6 +31,11 @@ ended = nursery.hear()
 nursery.close()
 print(json.dumps([started.pid, wrote, ended.pid, ended.status]))
 """
+WITH_A_PLAN = """
+plan = os.memfd_create("plan")
+os.write(plan, b"what is to be done")
+nursery.start(sys.argv[1:], writing, plan)
+"""
 SAY = """
 import atexit, json, os, sys, threading
 atexit.register(lambda: print("bye"))
@@ -73,6 +78,15 @@ def test_a_program_finds_itself_as_if_it_had_been_called(
         "threads": 1,
         "descriptors": [0, 1, 2],
     }
+
+
+def test_a_program_finds_its_plan_without_a_folder(tmp_path: Path) -> None:
+    file = tmp_path / "program.py"
+    file.write_text("import sys\nfrom pathlib import Path\nprint(sys.argv[1], Path(sys.argv[1]).read_text())")
+    with_a_plan = START.replace("nursery.start(sys.argv[1:], writing)", WITH_A_PLAN)
+    command = [sys.executable, "-c", with_a_plan, str(file), str(tmp_path / "nowhere" / "node.json")]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
+    assert json.loads(done.stdout)[1] == "/proc/self/fd/3 what is to be done\n"
 
 
 @pytest.mark.parametrize(

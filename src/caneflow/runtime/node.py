@@ -379,7 +379,7 @@ class _OperatorNode(_ReaderNode):
         resumed = self.resume()
         try:
             self.handle_all(resumed=resumed)
-        except Exception:
+        except (Exception, SystemExit):
             self.keeper.note_failure()
             raise
 

@@ -1,4 +1,4 @@
-"""What one node needs to know to run, wherever it runs: written by the launcher, read by the node's process."""
+"""What one node needs to know to run, wherever it runs: made by the launcher, read by the node's process."""
 
 from functools import cached_property
 from pathlib import Path
@@ -80,9 +80,9 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
         """The nodes that read an output."""
         return tuple(dict.fromkeys(reader for out in self.outputs.values() for reader in out.readers))
 
-    def write(self, path: Path) -> None:
-        """Store the plan for the node's process."""
-        path.write_bytes(msgspec.json.encode(self))
+    def encoded(self) -> bytes:
+        """The plan as the node's process reads it."""
+        return msgspec.json.encode(self)
 
     @classmethod
     def read(cls, path: Path) -> "NodePlan":

@@ -510,24 +510,25 @@ class Launcher:
     # --- what goes out ----------------------------------------------------------------------------------------
 
     def _start(self, node: NodeState) -> None:
-        path = self._directory.path / f"{node.plan.node}.json"
-        plan = node.plan
+        folder = self._directory.path
+        plan = msgspec.structs.replace(node.plan, state_folder=str(self._state_folder or folder))
         if self._barrier_passed and plan.module == REPLAYER_MODULE:
             settings = {**plan.settings, "started_s": self._started_s}
             plan = msgspec.structs.replace(plan, settings=settings)
         # What a spare reader misses at the start it asks for: nobody waits for it, as it may never come.
         absent = tuple(name for name, other in self._nodes.items() if other.spare)
         if self._company is not None:
-            folder = str(self._state_folder) if self._state_folder else None
-            away = self._company.out_of_reach(plan.readers)
-            plan = msgspec.structs.replace(plan, absent=away, state_folder=folder)
+            plan = msgspec.structs.replace(plan, absent=self._company.out_of_reach(plan.readers))
         plan = msgspec.structs.replace(plan, absent=(*plan.absent, *absent), takes_over=node.restarts > 0)
         if node.restarts and plan.module == RECORDER_MODULE:
             plan = msgspec.structs.replace(plan, settings={**plan.settings, "goes_on": True})
-        plan.write(path)
         node.state, node.last_words = "starting", None
         node.started_at = time.monotonic()
-        node.pid = self._processes.start(node.plan.node, program_arguments(node.plan), path)
+        try:
+            arguments, called = program_arguments(plan), folder / f"{plan.node}.json"
+            node.pid = self._processes.start(plan.node, arguments, plan.encoded(), called)
+        except OSError as error:
+            self._restart_or_fail(node, f"cannot be started: {error.strerror}", How.STOPPED, None)
 
     def _look_at_deadlines(self) -> None:
         now = time.monotonic()

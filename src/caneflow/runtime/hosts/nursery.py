@@ -28,6 +28,8 @@ from caneflow.runtime.hosts.last_words import telling_failures
 
 REQUEST_BYTES = 65_536  # of the longest command line
 PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal for a process whose parent dies
+PLAN = 3  # the descriptor under which a process finds its plan
+PLAN_PATH = f"/proc/self/fd/{PLAN}"
 RESET = (signal.SIGTERM, signal.SIGCHLD)
 
 
@@ -62,12 +64,14 @@ class Nursery:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def start(self, arguments: Sequence[str], output: int) -> None:
+    def start(self, arguments: Sequence[str], output: int, plan: int | None = None) -> None:
         """Start what follows `python`; what it writes goes to the descriptor `output`. Started says its pid.
 
-        Raises OSError when the nursery has been killed.
+        `plan`: a descriptor of the file that the last argument names. The process finds it as PLAN_PATH, so that no
+        folder is needed at a restart. Raises OSError when the nursery has been killed.
         """
-        socket.send_fds(self._socket, [msgspec.msgpack.encode(arguments)], [output])
+        descriptors = [output] if plan is None else [output, plan]
+        socket.send_fds(self._socket, [msgspec.msgpack.encode(arguments)], descriptors)
 
     def hear(self) -> Started | Ended | None:
         """Wait for the next word; None: the nursery has ended, and its nodes with it."""
@@ -117,15 +121,16 @@ class _Parent:
         ready, _, _ = select.select([self._socket.fileno(), woken], [], [])
         if self._socket.fileno() not in ready:
             return True
-        request, outputs, _, _ = socket.recv_fds(self._socket, REQUEST_BYTES, 1)
+        request, descriptors, _, _ = socket.recv_fds(self._socket, REQUEST_BYTES, 2)
         if not request:
             return False
         arguments = msgspec.msgpack.decode(request, type=list[str])
         pid = os.fork()
         if pid == 0:
             self._socket.close()
-            _end(lambda: _become(arguments, outputs[0], parent=self._pid))
-        os.close(outputs[0])
+            _end(lambda: _become(arguments, *descriptors, parent=self._pid))
+        for descriptor in descriptors:
+            os.close(descriptor)
         self._running.add(pid)
         self._say(Started(pid))
         return True
@@ -146,7 +151,7 @@ class _Parent:
             self._socket.send(msgspec.msgpack.encode(word))
 
 
-def _become(arguments: Sequence[str], output: int, parent: int) -> None:
+def _become(arguments: Sequence[str], output: int, plan: int | None = None, *, parent: int) -> None:
     """Be what `python ARGUMENTS` would be, in a session of its own, from a fork."""
     os.setsid()
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -158,11 +163,16 @@ def _become(arguments: Sequence[str], output: int, parent: int) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.dup2(output, 1)
     os.dup2(output, 2)
-    os.closerange(3, os.sysconf("SC_OPEN_MAX"))
+    if plan is not None:
+        os.dup2(plan, PLAN)
+        os.set_inheritable(PLAN, False)
+    os.closerange(PLAN if plan is None else PLAN + 1, os.sysconf("SC_OPEN_MAX"))
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # typeshed takes them for any TextIO
     setproctitle(" ".join(("python", *arguments)))
     setthreadtitle(Path(arguments[-1]).stem)  # the node's name, where only fifteen letters are shown
+    if plan is not None:
+        arguments = [*arguments[:-1], PLAN_PATH]
     with telling_failures(building=True):  # before the program has come to its own `run`
         if arguments[0] == "-m":
             sys.argv = list(arguments[1:])

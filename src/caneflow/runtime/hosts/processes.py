@@ -6,7 +6,7 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -67,15 +67,22 @@ class Processes:
         self._nursery.close()
         self._listener.join()
 
-    def start(self, node: str, program: Sequence[str], plan: Path) -> int:
-        """Start the node's process; its pid, or 0 when the nursery is lost."""
+    def start(self, node: str, program: Sequence[str], plan: bytes, called: Path) -> int:
+        """Start the node's process with its plan, `called` so where processes are listed.
+
+        Its pid, or 0 when the nursery is lost. Raises OSError when this process has no descriptors left.
+        """
+        with _in_memory(plan) as descriptor:
+            return self._start(node, [*program, str(called)], descriptor)
+
+    def _start(self, node: str, arguments: Sequence[str], plan: int) -> int:
         reading, writing = os.pipe()
         lines = os.fdopen(reading, encoding="utf-8", errors="replace")
         process = _Process(node, threading.Thread(target=self._read, args=(node, lines), daemon=True))
         process.reader.start()
         try:
             self._asked.put(process)
-            self._nursery.start([*program, str(plan)], writing)
+            self._nursery.start(arguments, writing, plan)
             process.started.wait()
         except OSError:
             return 0  # the listener knows as well, and has said so
@@ -138,6 +145,18 @@ class Processes:
         with lines:
             for line in lines:
                 self._events.put(Line(node, line.rstrip("\n")))
+
+
+@contextlib.contextmanager
+def _in_memory(data: bytes) -> Iterator[int]:
+    """A descriptor of a file in memory that holds `data`: there is always room for it."""
+    descriptor = os.memfd_create("plan")
+    try:
+        with open(descriptor, "wb", closefd=False) as file:
+            file.write(data)
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 def _signal(process: _Process, number: int) -> None:
