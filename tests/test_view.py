@@ -318,7 +318,24 @@ def test_the_page_lets_nothing_in_from_outside(served: tuple[LiveStreams, Any]) 
     assert "cache-control: no-store" in head
 
 
-@pytest.mark.parametrize("path", ["/../server.py", "/%2e%2e/server.py", "/nothing.js", "/uplot-LICENSE.txt/.."])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../server.py",
+        "/%2e%2e/server.py",
+        "/%2e%2e%2fserver.js",
+        "/nothing.js",
+        "/uplot-LICENSE.txt/..",
+        "/.html",
+        "//index.html",
+        "/%00.js",
+        "/%ff.js",
+        pytest.param("/" + 5_000 * "a", id="longer than a file's name may be"),
+        pytest.param("/" + 5_000 * "a" + ".js", id="the same of a known kind"),
+        pytest.param("/" + 3_000 * "%41" + ".html", id="the same in escapes"),
+        pytest.param("/" + 3_000 * "a/" + "x.js", id="deeper than a path may be"),
+    ],
+)
 def test_only_the_files_of_the_page_are_served(served: tuple[LiveStreams, Any], path: str) -> None:
     head = answered(served[1].port, f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
     assert head.startswith(b"HTTP/1.1 404")
@@ -336,14 +353,25 @@ def test_nothing_is_compressed_for_a_page_on_the_same_machine(served: tuple[Live
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"key": "guess"}, {"key": ""}, {"origin": "http://evil.example"}, {"host": "evil.example"}]
+    "wrong",
+    [
+        {"key": "guess"},
+        {"key": ""},
+        {"key": "%00%ff"},
+        {"origin": "http://evil.example"},
+        {"origin": "http://["},
+        {"host": "evil.example"},
+        {"host": "["},
+        {"host": "[localhost]"},
+    ],
 )
 def test_others_are_not(served: tuple[LiveStreams, Any], wrong: dict[str, str]) -> None:
     assert answered(served[1].port, upgrade(served[1], **wrong)).startswith(b"HTTP/1.1 403")
 
 
-def test_a_rebound_name_is_refused(served: tuple[LiveStreams, Any]) -> None:
-    head = answered(served[1].port, f"GET / HTTP/1.1\r\nHost: evil.example:{served[1].port}\r\n\r\n")
+@pytest.mark.parametrize("host", ["evil.example", "[", "[localhost]", "]"])
+def test_a_name_that_is_not_this_machines_is_refused(served: tuple[LiveStreams, Any], host: str) -> None:
+    head = answered(served[1].port, f"GET / HTTP/1.1\r\nHost: {host}:{served[1].port}\r\n\r\n")
     assert head.startswith(b"HTTP/1.1 403")
 
 

@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
 from typing import Any, Protocol
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 import msgspec
 import uvicorn
@@ -185,11 +185,12 @@ class PageServer:
 
     async def _file(self, request: Request) -> Response:
         name = request.path_params.get("name", "index.html")
-        file = files("caneflow.viewing").joinpath("page", name)
         kind = TYPES.get(name.rpartition(".")[2])
-        if kind is None or not file.is_file():
+        # A stranger's name is compared with those that there are, and never given to the file system.
+        page = {file.name: file for file in files("caneflow.viewing").joinpath("page").iterdir()}
+        if kind is None or name not in page:
             return PlainTextResponse("not here\n", status_code=404)
-        return Response(file.read_bytes(), media_type=kind)
+        return Response(page[name].read_bytes(), media_type=kind)
 
     async def _samples(self, websocket: WebSocket) -> None:
         if not self._is_of_this_page(websocket):
@@ -210,7 +211,7 @@ class PageServer:
 
     def _is_of_this_page(self, websocket: WebSocket) -> bool:
         key = websocket.query_params.get("key", "")
-        origin = urlsplit(websocket.headers.get("origin", ""))
+        origin = _split(websocket.headers.get("origin", ""))
         return secrets.compare_digest(key.encode(), self._key.encode()) and origin.netloc == websocket.headers["host"]
 
     async def _answer(self, websocket: WebSocket, client: _Client) -> None:
@@ -242,7 +243,7 @@ class _OnlyHere:
         if scope["type"] == "lifespan":
             await self._application(scope, receive, send)
             return
-        host = urlsplit(f"//{Headers(scope=scope).get('host', '')}").hostname
+        host = _split(f"//{Headers(scope=scope).get('host', '')}").hostname
         if host not in LOOPBACK:
             if scope["type"] == "http":
                 await PlainTextResponse("this page is for this machine only\n", status_code=403)(scope, receive, send)
@@ -256,6 +257,14 @@ class _OnlyHere:
             await send(message)
 
         await self._application(scope, receive, fenced)
+
+
+def _split(address: str) -> SplitResult:
+    """The parts of an address that a stranger names; all are empty when it is none."""
+    try:
+        return urlsplit(address)
+    except ValueError:  # e.g. an unclosed bracket
+        return urlsplit("")
 
 
 def _listen(port: int) -> socket.socket:
