@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from caneflow.messages import Imu, numbered, sample_key
 from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
 from caneflow.recording import Recording
 from caneflow.runtime.hosts import attach
-from caneflow.runtime.hosts.attach import Attached, attached, parted
+from caneflow.runtime.hosts.attach import Attached, Heard, attached, parted
 from caneflow.runtime.hosts.run_directory import RunningFlow, running_flows
+from tools.echo import missed_told
 
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
 DEADLINE = 30.0  # s for anything that is waited for
@@ -249,6 +251,18 @@ def test_echo_prints_samples_as_they_are_on_the_wire(caneflow: Callable[..., Run
     assert re.fullmatch(r"source/tick  \d+  \d{10}\.\d{9}  gyro=\(0, 0, 0\.5\)", out.splitlines()[0])
     told = json.loads(caneflow("echo", f"{flow}/source/tick", "--count", 1, "--json")[1])
     assert (told["stream"], told["schema"], told["gyro"]) == ("source/tick", "caneflow.Imu/1", [0, 0, 0.5])
+
+
+def test_echo_tells_what_it_missed_of_each_stream(capsys: pytest.CaptureFixture[str]) -> None:
+    heard = [("a", seq) for seq in (5, 6, 9, 7, 10)] + [("b", seq) for seq in (100, 103)]
+    with suppress(KeyboardInterrupt), missed_told() as missed:
+        for port, seq in heard:
+            payload = numbered(Imu(stamp=SECOND, gyro=GYRO), seq)
+            missed.take(Heard(f"cane/imu/{port}", "caneflow.Imu/1", payload, 0))
+        missed.take(Heard("cane/imu/a", "caneflow.Imu/1", b"no sample", 0))
+        raise KeyboardInterrupt
+
+    assert capsys.readouterr().err == "4 samples missed: they came faster than this command took them\n"
 
 
 def test_echo_that_hears_nothing_says_what_to_try(caneflow: Callable[..., Run], flow: str) -> None:

@@ -5,6 +5,8 @@ import math
 import queue
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import msgspec
@@ -44,18 +46,14 @@ def command(
     with attached(name, at, keys) as here:
         kinds = {edge.writer: edge.schema for edge in here.status().edges}
         inbox: queue.SimpleQueue[Heard] = queue.SimpleQueue()
-        left_out = 0
 
         def hear(heard: Heard) -> None:
-            nonlocal left_out
             if inbox.qsize() < MOST_WAITING:
                 inbox.put(heard)
-            else:
-                left_out += 1
 
         until = math.inf if seconds is None else time.monotonic() + seconds
         printed = 0
-        with here.samples(streams or [(ANY, ANY)], hear):
+        with here.samples(streams or [(ANY, ANY)], hear), missed_told() as missed:
             while (count is None or printed < count) and time.monotonic() < until:
                 try:
                     heard = inbox.get(timeout=min(0.2, max(0.0, until - time.monotonic())))
@@ -63,11 +61,39 @@ def command(
                     continue
                 print(told(heard, kinds, as_json=as_json), flush=True)
                 printed += 1
-        if left_out:
-            print(f"{left_out} samples left out: they came faster than they could be printed", file=sys.stderr)
+                missed.take(heard)
         if not printed:
             named = ", ".join("/".join(stream) for stream in streams) or here.flow
             raise CaneflowError(f"nothing came of {named} in {seconds:g} s; `caneflow status {here.flow}` shows why")
+
+
+class Missed:
+    """Counts the samples between those that came, by their numbers."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._last: dict[str, int] = {}  # by key the seq of the newest
+
+    def take(self, heard: Heard) -> None:
+        """Note a sample that came."""
+        try:
+            seq = decode(heard.payload, Sample).seq
+        except MessageError:
+            return
+        last = self._last.get(heard.key, seq - 1)
+        self.count += max(0, seq - last - 1)
+        self._last[heard.key] = max(last, seq)
+
+
+@contextmanager
+def missed_told() -> Iterator[Missed]:
+    """Tell at the end, also after Ctrl-C, what was missed: a flow does not wait for a tool."""
+    missed = Missed()
+    try:
+        yield missed
+    finally:
+        if missed.count:
+            print(f"{missed.count} samples missed: they came faster than this command took them", file=sys.stderr)
 
 
 def told(heard: Heard, kinds: dict[str, str], *, as_json: bool) -> str:

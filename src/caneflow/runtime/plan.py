@@ -52,6 +52,7 @@ class Links(msgspec.Struct, frozen=True, kw_only=True):
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
+    identity: str = ""  # of the node's session, by which the launcher knows it from a tool's
 
 
 class NodePlan(msgspec.Struct, frozen=True, kw_only=True):

@@ -133,7 +133,10 @@ class Bus:
         # Takes an event on the thread that brought it; False: it did not, and the event goes into the inbox.
         self.at_once: Callable[[Event], bool] | None = None
         self._threads = KnownThreads()
-        self._session = open_session(listen=plan.links.listen, connect=plan.links.connect, replay=plan.replay)
+        links = plan.links
+        self._session = open_session(
+            listen=links.listen, connect=links.connect, replay=plan.replay, identity=links.identity
+        )
         # Whatever must outlive its statement: a liveliness token that no variable holds is undeclared at once.
         self._held: list[Held] = []
         self._aside: list[tuple[zenoh.Subscriber[Any], threading.Thread]] = []

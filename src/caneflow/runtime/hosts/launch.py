@@ -2,6 +2,7 @@
 
 import logging
 import queue
+import secrets
 import signal
 import sys
 import time
@@ -26,8 +27,9 @@ from caneflow.runtime.deployment import (
 )
 from caneflow.runtime.hosts import last_words
 from caneflow.runtime.hosts.clocks import Answer, Clocks
+from caneflow.runtime.hosts.congestion import closing_at_once, launcher_ids, node_id, node_ids, tool_links
 from caneflow.runtime.hosts.last_words import LastWords
-from caneflow.runtime.hosts.links import Ports, open_session
+from caneflow.runtime.hosts.links import Ports, open_session, protocol
 from caneflow.runtime.hosts.machines import (
     LINK_SETTINGS,
     Began,
@@ -153,6 +155,7 @@ class Launcher:
         keys: Path | None = None,
     ) -> None:
         """`keys`: the folder with this machine's certificate, where the flow has several machines."""
+        self._run = secrets.token_hex(8)  # nobody can guess the ids of its nodes' sessions
         self._nursery = nursery
         self._keys = keys
         self._events: queue.SimpleQueue[object] = queue.SimpleQueue()
@@ -203,13 +206,25 @@ class Launcher:
     # --- the other machines -----------------------------------------------------------------------------------
 
     def _open_session(self, endpoint: str) -> zenoh.Session:
-        site, replay = self._deployment.site, self._deployment.replay
+        deployment, site = self._deployment, self._deployment.site
+        here = filter(deployment.runs_here, deployment.plans)
+        own = [each for node in here for each in node_ids(self._run, node)]
         if site is None:
-            return open_session(listen=[endpoint], replay=replay)
-        site, secured = links_between(self._deployment, site, self._keys)
-        more = {**LINK_SETTINGS, **secured}
+            more = tool_links(deployment.flow, [protocol(endpoint)], own, replay=deployment.replay)
+            return open_session(listen=[endpoint], replay=deployment.replay, more=more)
+        site, secured = links_between(deployment, site, self._keys)
+        own += [each for machine in site.others for each in launcher_ids(deployment.flow, machine)]
+        strangers = {protocol(each) for each in (endpoint, *site.listen)}
+        if site.router is not None:  # its session has an id that nobody knows beforehand, and must lose nothing
+            strangers.discard(protocol(site.connect[-1]))
+        more = tool_links(deployment.flow, strangers, own, replay=deployment.replay) if strangers else {}
         return open_session(
-            mode="router", listen=[endpoint, *site.listen], connect=site.connect, replay=replay, more=more
+            mode="router",
+            listen=[endpoint, *site.listen],
+            connect=site.connect,
+            replay=deployment.replay,
+            identity=secrets.choice(launcher_ids(deployment.flow, site.name)),
+            more={**LINK_SETTINGS, **secured, **more},
         )
 
     def _gather(self) -> bool:
@@ -313,6 +328,7 @@ class Launcher:
         """Hear the nodes, and answer whoever asks, before anybody can know of this run."""
         flow = self._deployment.flow
         held: list[object] = [
+            closing_at_once(self._session),
             self._session.declare_subscriber(control_key(flow, "counters", "*"), self._hearing(Counters)),
             self._session.liveliness().declare_subscriber(
                 control_key(flow, "ready", "*"),
@@ -522,6 +538,8 @@ class Launcher:
         plan = msgspec.structs.replace(plan, absent=(*plan.absent, *absent), takes_over=node.restarts > 0)
         if node.restarts and plan.module == RECORDER_MODULE:
             plan = msgspec.structs.replace(plan, settings={**plan.settings, "goes_on": True})
+        identity = node_id(self._run, plan.node, node.restarts)
+        plan = msgspec.structs.replace(plan, links=msgspec.structs.replace(plan.links, identity=identity))
         node.state, node.last_words = "starting", None
         node.started_at = time.monotonic()
         try:

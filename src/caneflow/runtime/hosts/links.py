@@ -24,6 +24,7 @@ WAIT_BEFORE_CLOSE = 600_000_000  # us that a replay's blocking put waits before 
 # A burst of 100 small express samples with Zenoh's default queue of 2 batches and 1 ms: 12 % dropped on loopback.
 # With these: none, and no put took longer than 3 ms.
 BATCHES = 16  # that may wait to be sent; Zenoh's greatest
+FULL = ("data", "data_low")  # the priorities of samples: to readers, and to tools
 WAIT_BEFORE_DROP = 20_000  # us that a live put waits before the sample is dropped
 PRIORITIES = (
     "control",
@@ -41,6 +42,9 @@ THREADS = {  # read once by Zenoh, when the first session of a process opens
     "ZENOH_RUNTIME": "(rx: (worker_threads: 1), net: (handover: rx))",
     "RUST_MIN_STACK": str(8 * 2**20),  # bytes: operators run on that thread, and Python is used to 8 MiB, not to 2
 }
+# What Zenoh prints unless RUST_LOG says. Where access control has refused a declaration, Zenoh prints an error for its
+# end ("Unknown token id=2"), on the standard output; that one is expected.
+LOGGED = "error,zenoh::net::routing::hat=off,zenoh::net::routing::dispatcher=off"
 RETRY = {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2}
 SENT_AT_BYTES = 8  # of a sample's attachment: ns, little-endian
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ports, so that no outgoing connection takes one
@@ -52,15 +56,16 @@ def open_session(
     listen: Sequence[str] = (),
     connect: Sequence[str] = (),
     replay: bool = False,
+    identity: str = "",
     more: Mapping[str, Any] | None = None,
 ) -> zenoh.Session:
     """A session on exactly these endpoints; raises DataflowError when it cannot be opened.
 
-    `more`: further settings of Zenoh, by path.
+    `identity`: its id in hexadecimal; "": a random one. `more`: further settings of Zenoh, by path.
     """
     for variable, value in THREADS.items():
         os.environ.setdefault(variable, value)
-    zenoh.init_log_from_env_or("error")
+    zenoh.init_log_from_env_or(LOGGED)
     # Live, a router that waits for a dead link longer than the lease would hold up the nodes that dial it.
     patience = WAIT_BEFORE_CLOSE if replay else LIVE_LEASE * 1_000
     settings = {
@@ -72,9 +77,10 @@ def open_session(
         "scouting/gossip/enabled": False,
         "open/return_conditions/connect_scouted": False,
         "transport/link/tx/lease": REPLAY_LEASE if replay else LIVE_LEASE,
-        "transport/link/tx/queue/size": {priority: BATCHES if priority == "data" else 2 for priority in PRIORITIES},
+        "transport/link/tx/queue/size": {priority: BATCHES if priority in FULL else 2 for priority in PRIORITIES},
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": patience,
+        **({"id": identity} if identity else {}),
         **(more or {}),
     }
     config = zenoh.Config()
@@ -85,7 +91,15 @@ def open_session(
     except zenoh.ZError as error:
         where = ", ".join((*listen, *connect))
         cause = str(error).partition(" at /")[0].strip()  # Zenoh adds the place in its own source
+        if cause.startswith("Unable to connect"):
+            refused = ", or one side refuses the other's certificate" if where.startswith(("tls/", "quic/")) else ""
+            cause = f"nobody answers there{refused}; `caneflow doctor --at {where}` finds the cause"
         raise DataflowError(f"no Zenoh session on {where}: {cause}") from error
+
+
+def protocol(endpoint: str) -> str:
+    """Of an endpoint: tcp, tls, unixsock-stream; "" of none."""
+    return endpoint.partition("/")[0]
 
 
 class KnownThreads:

@@ -1,0 +1,98 @@
+"""Who may hold up a launcher: in a replay the flow's own nodes and machines, a tool never.
+
+A launcher passes samples on to tools, and between machines. Where one of those links is full, Zenoh holds up the thread
+that receives for all of them, if the sample's writer said BLOCK, as in a replay. So what goes to a tool is dropped
+instead. Zenoh tells links apart by their protocol and by the id of the session at the other end: the sessions of a
+flow's own nodes and launchers have ids that are known beforehand, and every other one is a tool.
+"""
+
+import socket
+import struct
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from caneflow.messages import control_key
+
+ID_BYTES = 16  # of a Zenoh session's id
+# Zenoh refuses a second session of one id while it takes the first for alive, which after a cut is the lease: so one
+# that is started again takes another id of its own.
+NODE_STARTS = 16  # ids that a node takes in turn
+LAUNCHER_STARTS = 256  # ids of a machine's launcher, of which it takes a random one
+
+
+def node_id(run: str, node: str, start: int) -> str:
+    """The id of a node's session, started for the `start`-th time in this run of its launcher."""
+    return _session_id("node", run, node, start % NODE_STARTS)
+
+
+def node_ids(run: str, node: str) -> list[str]:
+    """All ids that a node's session may have."""
+    return [node_id(run, node, start) for start in range(NODE_STARTS)]
+
+
+def launcher_ids(flow: str, machine: str) -> list[str]:
+    """All ids that the session of a machine's launcher may have."""
+    return [_session_id("launcher", flow, machine, start) for start in range(LAUNCHER_STARTS)]
+
+
+def tool_links(flow: str, protocols: Iterable[str], own: Sequence[str], *, replay: bool) -> dict[str, Any]:
+    """Zenoh's settings for a launcher whose links of `protocols` are tools', but for the sessions `own` of its flow.
+
+    Samples go to tools behind everything else, so that a question is answered however much waits. Nothing waits for
+    room: a tool that takes less than it is sent would slow down the launcher to its own pace.
+    """
+    samples, words = f"{flow}/**", control_key(flow, "**")
+    to_tools, to_own = {"link_protocols": sorted(set(protocols))}, {"zids": list(own)}
+    # The later rule counts: it makes links of the flow's own what they were. Batches hold more than one sample, and so
+    # a burst, where the samples are not express.
+    rules = [
+        ("to tools", to_tools, [samples, words], ("drop", "data_low")),
+        ("own samples", to_own, [samples], ("block" if replay else "drop", "data")),
+        ("own words", to_own, [words], ("block", "data")),
+    ]
+    return {
+        "qos/network": [
+            {
+                "id": name,
+                **links,
+                "flows": ["egress"],
+                "messages": ["put", "delete"],
+                "key_exprs": keys,
+                "overwrite": {"congestion_control": congestion, "priority": priority, "express": False},
+            }
+            for name, links, keys, (congestion, priority) in rules
+        ],
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+    }
+
+
+def closing_at_once(session: zenoh.Session) -> object:
+    """Close links without a wait, for as long as what is returned is kept.
+
+    Zenoh has the kernel wait for 10 s, at the end of a TCP link, until the other end has read everything (SO_LINGER).
+    Where that one is frozen, the thread that receives for all links waits.
+    """
+    handler = zenoh.handlers.Callback(_end_lingering, indirect=False)
+    return session.info.declare_link_events_listener(handler, history=True)
+
+
+def _end_lingering(_: zenoh.LinkEvent) -> None:
+    """Switch the wait off on every TCP socket of this process."""
+    for path in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # it is no socket, or closed meanwhile
+            link = socket.socket(fileno=int(path.name))
+            try:
+                if link.family in (socket.AF_INET, socket.AF_INET6) and link.type == socket.SOCK_STREAM:
+                    link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+            finally:
+                link.detach()
+
+
+def _session_id(*names: object) -> str:
+    digest = blake2b(repr(names).encode(), digest_size=ID_BYTES).hexdigest()
+    return "c" + digest[1:]  # Zenoh refuses leading zeros
