@@ -6,13 +6,15 @@ import stat
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
+from ruamel.yaml import YAML
 
-from caneflow.messages import Imu, control_key, numbered, sample_key
+from caneflow.messages import Imu, control_key, numbered, sample_key, stream_of
 from caneflow.runtime.dataflow.loading import examine, load
 from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
@@ -22,6 +24,7 @@ from caneflow.runtime.hosts.run_directory import running_flows
 from caneflow.runtime.hosts.security import access_control, check_access_control, machine_grants
 from tests.flows import CANEFLOW, Launched, free_port, launchers, spread_cane, wait_for
 
+DATAFLOWS = Path(__file__).parents[1] / "dataflows"
 SPLIT = {"imu": "gateway", "radar": "gateway", "ground_speed": "gateway", "fusion": "phone"}
 
 
@@ -117,7 +120,7 @@ def test_a_machine_may_send_what_its_nodes_write_and_others_read(tmp_path: Path)
     assert [key for key in from_phone["put"] if "@" not in key] == []  # nobody there reads a pose
     assert {"cane/@/start", "cane/@/end", "cane/@/window"} <= set(from_gateway["put"])
     assert not {"cane/@/start", "cane/@/end", "cane/@/window", "cane/@/late"} & set(from_phone["put"])
-    assert from_phone["query"][:2] == ["cane/@/history/imu/*", "cane/@/history/ground_speed/*"]
+    assert from_phone["query"][:2] == ["cane/@/history/ground_speed/speed", "cane/@/history/imu/imu"]
     assert "cane/@/ready/fusion" in from_phone["liveliness_token"]
     assert "cane/@/ready/imu" not in from_phone["liveliness_token"]
 
@@ -131,6 +134,32 @@ def test_a_machine_that_records_may_read_every_stream(tmp_path: Path) -> None:
 
     assert "cane/fusion/pose" in from_phone["put"]
     assert "cane/@/late" in from_phone["put"]
+
+
+@pytest.mark.parametrize("records", [False, True])
+@pytest.mark.parametrize("name", ["dataflow.yaml", *(f"dataflows/{path.name}" for path in DATAFLOWS.glob("*.yaml"))])
+def test_past_samples_are_granted_where_the_samples_are(name: str, records: bool, tmp_path: Path) -> None:
+    yaml = YAML(typ="safe", pure=True)
+    graph = yaml.load(DATAFLOWS.parent / name)
+    graph["machines"] = {
+        "gateway": {"listen": ["tcp/127.0.0.1:7447"], "records": records},
+        "phone": {"connect": ["tcp/127.0.0.1:7447"]},
+    }
+    for node, machine in zip(graph["nodes"].values(), cycle(graph["machines"])):
+        node["machine"] = machine
+    file = tmp_path / "flow.yaml"
+    yaml.dump(graph, file)
+    deployment = deploy(load(file), machine="gateway")
+    site = deployment.site
+    assert site is not None
+
+    for writer, reader in (("gateway", "phone"), ("phone", "gateway")):
+        gives, takes = (machine_grants(deployment, site, *ends) for ends in ((writer, reader), (reader, writer)))
+        history = control_key(deployment.flow, "history")
+        past = {control_key(deployment.flow, "history", *stream_of(key)) for key in gives["put"] if "@" not in key}
+        assert past, "the machines share wires"
+        for granted in (gives["reply"], gives["declare_queryable"], takes["query"]):
+            assert {key for key in granted if key.startswith(history)} == past
 
 
 def broken(change: Callable[[dict[str, Any]], None], tmp_path: Path) -> dict[str, Any]:
@@ -213,6 +242,7 @@ class Target:
 
     def __init__(self, flow: str, launched: Launched, port: int, keys: Path) -> None:
         self.flow = flow
+        self.launched = launched
         self.address = f"tls/127.0.0.1:{port}"
         self.keys = keys
         wait_for(
@@ -269,6 +299,9 @@ class Heard:
         return self.keys
 
 
+REFUSED = (
+    r"no Zenoh session on tls/[\d.:]+: nobody answers there, or one side refuses the other's certificate; `caneflow"
+)
 SAMPLE = numbered(Imu(stamp=1, gyro=(0.0, 0.0, 0.0)), 0)
 
 
@@ -283,12 +316,12 @@ def say_until(condition: Callable[[], object], *puts: Callable[[], None]) -> Non
 
 
 def test_without_a_certificate_nothing_connects(target: Target) -> None:
-    with pytest.raises(DataflowError, match="no Zenoh session"):
+    with pytest.raises(DataflowError, match=REFUSED):
         target.session(None)
 
 
 def test_with_a_certificate_of_another_authority_nothing_connects(target: Target, foreign: Path) -> None:
-    with pytest.raises(DataflowError, match="no Zenoh session"):
+    with pytest.raises(DataflowError, match=REFUSED):
         target.session("phone", foreign)
 
 
@@ -342,6 +375,46 @@ def test_a_machine_does_not_speak_for_another_ones_nodes(target: Target) -> None
         look()
         del own, false  # an undeclared token is one that no variable holds
         assert seen == {control_key(flow, "ready", "fusion")}
+        list(phone.get(control_key(flow, "status"), timeout=5.0))  # a round trip: the ends of the tokens have come
+        assert "zenoh" not in target.launched.said, "what Zenoh says of a token that it does not know is no news"
+
+
+def test_past_samples_are_sent_for_wired_ports_only(target: Target) -> None:
+    asked: list[str] = []
+
+    def history(node: str, port: str) -> str:
+        return control_key(target.flow, "history", node, port)
+
+    def answer(query: zenoh.Query) -> None:
+        asked.append(str(query.key_expr))
+        with query:
+            query.reply(query.key_expr, SAMPLE)
+
+    handler = zenoh.handlers.Callback(answer, indirect=False)
+    wired = [history("imu", "imu"), history("ground_speed", "speed")]
+    unwired = [history("radar", "frame"), history("ground_speed", "other"), history("imu", "*"), history("*", "*")]
+    with (
+        target.session("phone") as phone,
+        target.session("laptop") as laptop,
+        target.local() as nodes,
+        target.local() as inside,
+    ):
+        held = [nodes.declare_queryable(key, handler) for key in (*wired, *unwired[:2])]
+        held.append(phone.declare_queryable(history("fusion", "pose"), handler))  # which nobody on the gateway reads
+
+        def answers(session: zenoh.Session, key: str) -> int:
+            others = zenoh.Locality.REMOTE
+            replies = session.get(key, timeout=1.0, target=zenoh.QueryTarget.ALL, allowed_destination=others)
+            return sum(reply.ok is not None for reply in replies)
+
+        wait_for(lambda: all(answers(phone, key) for key in wired), "what the phone's nodes may ask")
+        assert [answers(inside, key) for key in unwired[:2]] == [1, 1], "they are there"
+        asked.clear()
+        assert [answers(phone, key) for key in unwired] == [0] * 4
+        assert [answers(laptop, key) for key in (*wired, *unwired)] == [0] * 6
+        assert answers(inside, history("fusion", "pose")) == 0
+        assert asked == [], "nor do questions get there"
+        del held
 
 
 def test_a_machine_that_the_flow_does_not_know_neither_reads_nor_writes(target: Target) -> None:

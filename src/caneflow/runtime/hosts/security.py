@@ -9,12 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from caneflow.messages import MAX_PAYLOAD, control_key, sample_key
+from caneflow.messages import MAX_PAYLOAD, control_key, sample_key, stream_of
 from caneflow.runtime.dataflow.topology import is_open
 from caneflow.runtime.deployment import Deployment, Site, recorder_name
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.certificates import OBSERVER, ROUTER, Credentials, credentials
-from caneflow.runtime.plan import NodePlan
 
 Grants: TypeAlias = dict[str, list[str]]  # by kind of message the keys
 
@@ -138,10 +137,10 @@ def machine_grants(deployment: Deployment, site: Site, sender: str, receiver: st
     told += [control(word) for word in ("start", "window", "end")] if leads else [control("failed", sender)]
     told += [control("late")] if receiver in site.recorders else []
     heard += [control("late")] if sender in site.recorders else []
-    answered = [control("history", node, "*") for node in senders]
+    answered = [_history_of(key) for key in _samples_between(deployment, site, sender, receiver)]
     answered += [control("edge", node, reader) for node in receivers for reader in senders]
     answered += [control("status"), control("clock", sender)]
-    asked = [control("history", node, "*") for node in receivers if _reads_of(deployment, site, sender, node)]
+    asked = [_history_of(key) for key in _samples_between(deployment, site, receiver, sender)]
     asked += [control("edge", node, reader) for node in senders for reader in receivers]
     asked += [control("status"), control("clock", receiver)]
     everybody = [control("ready", "*"), control("machine", "*", "*", "*", "*")]
@@ -278,6 +277,11 @@ def _samples_between(deployment: Deployment, site: Site, writer: str, reader: st
     return sorted(written & read)
 
 
+def _history_of(key: str) -> str:
+    """Where past samples of the stream `key` are asked for."""
+    return control_key(key.partition("/")[0], "history", *stream_of(key))
+
+
 def _written_on(deployment: Deployment, site: Site, machine: str) -> set[str]:
     """The keys that nodes on `machine` publish."""
     return {
@@ -286,9 +290,3 @@ def _written_on(deployment: Deployment, site: Site, machine: str) -> set[str]:
         if site.places[name] == machine
         for port in plan.outputs
     }
-
-
-def _reads_of(deployment: Deployment, site: Site, reader: str, writer: str) -> bool:
-    """Whether a node on `reader` reads from the node `writer`."""
-    here: list[NodePlan] = [plan for name, plan in deployment.plans.items() if site.places[name] == reader]
-    return reader in site.recorders or any(wire.writer == writer for plan in here for wire in plan.inputs.values())
