@@ -1,9 +1,14 @@
 """The house: every room is installed, and the settings of the tools agree."""
 
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
+UNIT = ROOT / "deploy" / "caneflow@.service"
 
 
 def test_every_room_is_packaged() -> None:
@@ -11,3 +16,34 @@ def test_every_room_is_packaged() -> None:
     rooms = {".".join(path.parent.relative_to(ROOT / "src").parts) for path in (ROOT / "src").rglob("__init__.py")}
     programs = {f"caneflow.{room}" for room in ("operators", "drivers", "tools")}
     assert packages == rooms | programs
+
+
+def test_the_unit_of_a_service_leaves_a_flow_what_it_needs_and_no_more() -> None:
+    lines = [line.split("=", 1) for line in UNIT.read_text().splitlines() if "=" in line and not line.startswith("#")]
+    unit: dict[str, list[str]] = {}
+    for key, value in lines:
+        unit.setdefault(key, []).append(value)
+
+    closed = ["NoNewPrivileges", "PrivateTmp", "ProtectHome", "LockPersonality", "MemoryDenyWriteExecute"]
+    closed += [f"Protect{what}" for what in ("Clock", "Hostname", "KernelTunables", "KernelModules", "KernelLogs")]
+    closed += [f"Restrict{what}" for what in ("SUIDSGID", "Realtime", "Namespaces")]
+    assert {key: unit.get(key) for key in closed} == {key: ["yes"] for key in closed}
+    assert unit["CapabilityBoundingSet"] == [""]
+    assert unit["SystemCallFilter"] == ["@system-service", "~@privileged"]
+    assert unit["UMask"] == ["0077"]
+    assert unit["ProtectProc"] == ["invisible"]
+    assert unit["MemoryMax"] == ["75%"]
+    assert unit["OOMPolicy"] == [
+        "continue"
+    ]  # systemd would end the whole flow where its launcher starts one node again
+    assert set(unit["RestrictAddressFamilies"][0].split()) == {"AF_INET", "AF_INET6", "AF_UNIX"}
+    # Devices need their groups, the launcher its nodes' figures under /proc, two units one user's shared memory.
+    assert not {"PrivateUsers", "PrivateDevices", "ProcSubset", "RemoveIPC"} & set(unit)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed here")
+def test_systemd_takes_the_unit(tmp_path: Path) -> None:
+    copy = tmp_path / "caneflow@gateway.service"
+    copy.write_text(UNIT.read_text().replace("/opt/caneflow/bin/caneflow", "/bin/true"))
+    done = subprocess.run(["systemd-analyze", "verify", copy], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
