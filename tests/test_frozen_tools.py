@@ -121,7 +121,7 @@ def assert_goes_on_to_its_end(folder: Path, flow: str, *launched: Launched) -> N
         assert {node.node for node in here.status().nodes} == {"radar", "counter"}
     (folder / "go").touch()
     for each in launched:
-        assert each.ends(30) == 0, each.said
+        assert each.ends(20) == 0, each.said
     assert f"counter: {FRAMES} x count" in "".join(each.said for each in launched)
 
 
@@ -169,4 +169,18 @@ def test_only_what_goes_to_the_flow_itself_may_wait(replay: bool, samples: str) 
     assert rules[0]["link_protocols"] == ["tcp", "tls"]
     assert "zids" not in rules[0]
     assert [rule["zids"] for rule in rules[1:]] == [["c1", "c2"]] * 2
-    assert "link_protocols" not in rules[1]
+    assert not any("link_protocols" in rule for rule in rules[1:])
+
+
+def test_a_link_to_a_router_loses_nothing_whatever_its_protocol() -> None:
+    def told(*protocols: str) -> list[tuple[str, list[str], str]]:
+        rules = tool_links("cane", protocols, ["c1"], replay=True, router="tcp")["qos/network"]
+        return [
+            (rule["id"], rule["link_protocols"], rule["overwrite"]["congestion_control"])
+            for rule in rules
+            if "link_protocols" in rule
+        ]
+
+    router = ("samples to a router", ["tcp"], "block")
+    assert told("unixsock-stream") == [("to tools", ["unixsock-stream"], "drop"), router]
+    assert told("tcp") == [router]

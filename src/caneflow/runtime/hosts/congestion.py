@@ -40,20 +40,29 @@ def launcher_ids(flow: str, machine: str) -> list[str]:
     return [_session_id("launcher", flow, machine, start) for start in range(LAUNCHER_STARTS)]
 
 
-def tool_links(flow: str, protocols: Iterable[str], own: Sequence[str], *, replay: bool) -> dict[str, Any]:
+def tool_links(
+    flow: str, protocols: Iterable[str], own: Sequence[str], *, replay: bool, router: str = ""
+) -> dict[str, Any]:
     """Zenoh's settings for a launcher whose links of `protocols` are tools', but for the sessions `own` of its flow.
+
+    `router`: the protocol of a link to a router in the middle, whose session has an id that nobody knows beforehand.
+    It must lose nothing, so that no link of this protocol is taken for a tool's.
 
     Samples go to tools behind everything else, so that a question is answered however much waits. Nothing waits for
     room: a tool that takes less than it is sent would slow down the launcher to its own pace.
     """
     samples, words = f"{flow}/**", control_key(flow, "**")
-    to_tools, to_own = {"link_protocols": sorted(set(protocols))}, {"zids": list(own)}
+    to_tools = {"link_protocols": sorted(set(protocols) - {router})}
+    to_own = {"zids": list(own)}
+    to_router = {"link_protocols": [router] if router else []}
+    own_samples = ("block" if replay else "drop", "data")
     # The later rule counts: it makes links of the flow's own what they were. Batches hold more than one sample, and so
     # a burst, where the samples are not express.
     rules = [
         ("to tools", to_tools, [samples, words], ("drop", "data_low")),
-        ("own samples", to_own, [samples], ("block" if replay else "drop", "data")),
+        ("own samples", to_own, [samples], own_samples),
         ("own words", to_own, [words], ("block", "data")),
+        ("samples to a router", to_router, [samples], own_samples),
     ]
     return {
         "qos/network": [
@@ -66,6 +75,7 @@ def tool_links(flow: str, protocols: Iterable[str], own: Sequence[str], *, repla
                 "overwrite": {"congestion_control": congestion, "priority": priority, "express": False},
             }
             for name, links, keys, (congestion, priority) in rules
+            if all(links.values())  # Zenoh refuses an empty list
         ],
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }

@@ -214,10 +214,9 @@ class Launcher:
             return open_session(listen=[endpoint], replay=deployment.replay, more=more)
         site, secured = links_between(deployment, site, self._keys)
         own += [each for machine in site.others for each in launcher_ids(deployment.flow, machine)]
-        strangers = {protocol(each) for each in (endpoint, *site.listen)}
-        if site.router is not None:  # its session has an id that nobody knows beforehand, and must lose nothing
-            strangers.discard(protocol(site.connect[-1]))
-        more = tool_links(deployment.flow, strangers, own, replay=deployment.replay) if strangers else {}
+        strangers = map(protocol, (endpoint, *site.listen))
+        router = protocol(site.connect[-1]) if site.router else ""
+        more = tool_links(deployment.flow, strangers, own, replay=deployment.replay, router=router)
         return open_session(
             mode="router",
             listen=[endpoint, *site.listen],
