@@ -7,12 +7,14 @@ import socket
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import psutil
+import pytest
 
 from caneflow.messages import Imu, RadarFrame, numbered, sample_key
 from caneflow.recording import Recording, RecordingWriter
@@ -145,3 +147,31 @@ def wait_for(condition: Callable[[], object], what: str, deadline: float = 30.0)
     while not condition():
         assert time.monotonic() < end, f"waited {deadline} s for {what}"
         time.sleep(0.05)
+
+
+STRANGER = 65_534  # nobody's uid
+
+
+def as_stranger(work: Callable[[], object]) -> str:
+    """What `work` gives as another user of this computer, as text, or the name of what it raised; skips unless root."""
+    if os.getuid() != 0:
+        pytest.skip("only root can be another user for a moment")
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setgroups([])
+            os.setgid(STRANGER)
+            os.setuid(STRANGER)
+            os.write(writing, str(work()).encode())
+        except OSError as error:
+            os.write(writing, type(error).__name__.encode())
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as said:
+        text = said.read()
+    os.waitpid(child, 0)
+    return text

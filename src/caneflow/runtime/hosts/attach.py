@@ -1,5 +1,6 @@
 """How a tool gets at a running flow: finds it on this machine, joins it as a Zenoh client, asks and listens."""
 
+import logging
 import queue
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,11 +16,13 @@ from caneflow.messages import control_key, sample_key
 from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links import open_session, sent_at
-from caneflow.runtime.hosts.run_directory import RunningFlow, running_flows
+from caneflow.runtime.hosts.run_directory import RunningFlow, refused_addresses, running_flows
 from caneflow.runtime.wording import did_you_mean, listed
 
 if TYPE_CHECKING:
     from caneflow.runtime.hosts.certificates import Credentials
+
+log = logging.getLogger(__name__)
 
 ANSWER_TIMEOUT = 2.0  # s that a launcher has to answer; it takes some ms
 ASK_AGAIN = 0.1  # s: what a launcher declares may come a moment after the link to it
@@ -191,20 +194,37 @@ def endpoint_of(flow: str | None) -> str:
     """Where tools attach to the flow on this machine; raises DataflowError when there is none, or several."""
     running = running_flows()
     fitting = [found for found in running if flow in (None, found.flow)]
+    # Root also sees those of other users, which must not stand in the place of its own.
+    fitting = [found for found in fitting if not found.owner] or fitting
     if len(fitting) == 1:
-        return fitting[0].endpoint
+        return _where(fitting[0])
     if not running:
-        raise DataflowError("no flow runs on this machine; start one with `caneflow run FILE`, or name another's: --at")
-    names = sorted({found.flow for found in running})
+        refused = "".join(f"; {said}" for said in refused_addresses())
+        raise DataflowError(
+            f"no flow runs on this machine; start one with `caneflow run FILE`, or name another's: --at{refused}"
+        )
+    names = sorted({found.flow for found in (fitting or running)})
     if not fitting:
         hint = did_you_mean(str(flow), names) or f" there is {listed(names)}"
-        raise DataflowError(f"no flow {flow!r} runs on this machine;{hint}")
+        refused = "".join(f"; {said}" for said in refused_addresses())
+        raise DataflowError(f"no flow {flow!r} runs on this machine;{hint}{refused}")
     if flow is None and len(names) > 1:
         raise DataflowError(f"several flows run on this machine; name one of {listed(names)}")
     if _are_one(fitting):
-        return fitting[0].endpoint
-    each = listed(f"--at {found.endpoint} (pid {found.pid})" for found in fitting)
+        return _where(fitting[0])
+    each = listed(f"--at {found.endpoint} (pid {found.pid}{_of_whom(found)})" for found in fitting)
     raise DataflowError(f"{len(fitting)} flows {fitting[0].flow!r} run on this machine; choose by {each}")
+
+
+def _where(found: RunningFlow) -> str:
+    """Its endpoint; that it is another user's, which only root sees, is said."""
+    if found.owner:
+        log.warning("%s (pid %d)%s", found.flow, found.pid, _of_whom(found))
+    return found.endpoint
+
+
+def _of_whom(found: RunningFlow) -> str:
+    return f", of user {found.owner}" if found.owner else ""
 
 
 def _are_one(launchers: Sequence[RunningFlow]) -> bool:

@@ -42,6 +42,7 @@ from caneflow.runtime.hosts.machines import (
 )
 from caneflow.runtime.hosts.nursery import Nursery
 from caneflow.runtime.hosts.observations import Observations
+from caneflow.runtime.hosts.private_folder import PrivateFolder
 from caneflow.runtime.hosts.processes import Exited, Line, NurseryLost, Processes
 from caneflow.runtime.hosts.restarts import Again, How, Restarts
 from caneflow.runtime.hosts.run_directory import RunDirectory, remove_state_folder, state_folder
@@ -174,7 +175,7 @@ class Launcher:
         self._until = BEGIN
         self._say_window_at = 0.0  # s, monotonic
         self._outcome = Outcome()
-        self._state_folder: Path | None = None
+        self._state_folder: PrivateFolder | None = None
         self._observed = Observations()
 
     def run(self) -> Outcome:
@@ -183,12 +184,15 @@ class Launcher:
         try:
             endpoint = ports.endpoint()
             with (
+                RunDirectory(self._deployment.flow) as self._directory,
                 self._open_session(endpoint) as self._session,
                 self._subscribed(),
-                RunDirectory(self._deployment.flow, endpoint) as self._directory,  # tools may attach from here on
+                self._directory.announced(endpoint),  # tools may attach from here on
                 Processes(self._events, self._nursery) as self._processes,
                 self._signals(),
             ):
+                if self._directory.remark:
+                    self._report(LAUNCHER, f"{self._directory.remark}; this run is in {self._directory.path}")
                 if self._gather():
                     self._take_nodes(linked(self._deployment, ports, endpoint))
                     for node in self._nodes.values():
@@ -526,7 +530,8 @@ class Launcher:
 
     def _start(self, node: NodeState) -> None:
         folder = self._directory.path
-        plan = msgspec.structs.replace(node.plan, state_folder=str(self._state_folder or folder))
+        state = self._state_folder.path if self._state_folder else folder
+        plan = msgspec.structs.replace(node.plan, state_folder=str(state))
         if self._barrier_passed and plan.module == REPLAYER_MODULE:
             settings = {**plan.settings, "started_s": self._started_s}
             plan = msgspec.structs.replace(plan, settings=settings)

@@ -1,13 +1,34 @@
-"""Where a running flow keeps its plans and says how tools attach to it: one private folder per run."""
+"""Where a running flow keeps its plans and says how tools attach to it: one private folder per run.
+
+What lies in a folder of another user is not believed: neither by a launcher, which would run its plans and snapshots,
+nor by tools, which would connect to its addresses. Root's tools see the flows of all users, and say whose they are.
+"""
 
 import os
-import shutil
+import pwd
+import re
+import stat
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import msgspec
 import psutil
+
+from caneflow.messages import NAME
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.hosts.private_folder import NotOurs, PrivateFolder, folder_of_user
+from caneflow.runtime.wording import shown
+
+ADDRESS = "flow.json"
+LONGEST_ADDRESS = 4096  # bytes of flow.json
+SHOWN_OF_FLOW = 20  # letters of the flow's name in the run folder's: paths of sockets are short
+OTHERS_WRITE = 0o002
+SOCKETS = "unixsock-stream/"  # Zenoh's word for Unix sockets
+TCP = re.compile(r"tcp/127\.0\.0\.1:([0-9]{1,5})")
+OF_YOUR_OWN = "set XDG_RUNTIME_DIR to a folder of your own"
+OF_PROCESS = re.compile(r".*-([0-9]{1,10})")  # the name of a run folder, with the launcher's pid
 
 
 class RunningFlow(msgspec.Struct, frozen=True):
@@ -16,71 +37,199 @@ class RunningFlow(msgspec.Struct, frozen=True):
     flow: str
     pid: int  # of its launcher
     endpoint: str  # where tools attach, as Zenoh clients
+    owner: str = ""  # the other user whose flow it is; "": this user's own
 
 
 class RunDirectory:
-    """The folder of one run, there while it runs."""
+    """The folder of one run, there while it runs; a context manager.
 
-    def __init__(self, flow: str, endpoint: str) -> None:
-        self._running = RunningFlow(flow, os.getpid(), endpoint)
-        self.path = _root() / f"{flow}-{os.getpid()}"
+    Entering it raises DataflowError when no folder can be made that is this user's alone.
+    """
+
+    def __init__(self, flow: str) -> None:
+        self._flow = flow
+        self._name = f"{flow[:SHOWN_OF_FLOW]}-{os.getpid()}"
+        self.remark = ""  # why the run is not in the usual place, if it is not
 
     def __enter__(self) -> "RunDirectory":
-        _sweep()
-        self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        (self.path / "flow.json").write_bytes(msgspec.json.encode(self._running))
+        self._root, self.remark = _own_root()
+        _sweep(self._root)
+        self._root.remove(self._name)  # of a process that was killed and had the same pid
+        self._folder = self._root.child(self._name)
+        self.path = self._folder.path
         return self
 
     def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self.path, ignore_errors=True)
+        self._root.remove(self._name)
+        self._folder.close()
+        self._root.close()
+
+    @contextmanager
+    def announced(self, endpoint: str) -> Iterator[None]:
+        """Tell tools that they may attach to `endpoint`, while the block lasts."""
+        running = {"flow": self._flow, "pid": os.getpid(), "endpoint": endpoint}
+        self._folder.write(ADDRESS, msgspec.json.encode(running))
+        try:
+            yield
+        finally:
+            self._folder.remove(ADDRESS)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder is where it was made: a cleaner may have removed it."""
+        return self._folder.is_there
 
 
 def running_flows() -> list[RunningFlow]:
-    """The flows that run on this machine and that this user may see: the own ones; root sees all."""
-    found: dict[int, RunningFlow] = {}
-    for path in (path for root in _roots() for path in root.glob("*/flow.json")):
-        with suppress(OSError, msgspec.DecodeError):  # it may be ending, or be somebody else's
-            flow = msgspec.json.decode(path.read_bytes(), type=RunningFlow)
-            if psutil.pid_exists(flow.pid):
-                found[flow.pid] = flow
+    """The flows that run on this machine and that this user may believe: the own ones; root sees all."""
+    found = {flow.pid: flow for flow in _found() if isinstance(flow, RunningFlow)}
     return sorted(found.values(), key=lambda flow: (flow.flow, flow.pid))
 
 
-def _root() -> Path:
-    base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
-    return Path(base) / f"caneflow-{os.getuid()}"
+def refused_addresses() -> list[str]:
+    """What is wrong with this user's run folders whose flow cannot be reached, one line for each."""
+    return [said for said in _found() if isinstance(said, str)]
+
+
+def _found() -> Iterator[RunningFlow | str]:
+    """Every flow that runs, or what is wrong with the address that its run folder holds."""
+    me = os.getuid()
+    for root in _roots():
+        with suppress(OSError), folder_of_user(root, me) as (within, of_root):  # it may be ending, or another's
+            for name in os.listdir(within):  # noqa: PTH208 - not by its path
+                launcher = OF_PROCESS.fullmatch(name)
+                if launcher is None or not _belongs_to(int(launcher[1]), of_root.st_uid):
+                    continue
+                with suppress(OSError), folder_of_user(name, me, within) as (folder, of_folder):
+                    if of_folder.st_uid == of_root.st_uid:
+                        yield from _read_address(root / name, folder, int(launcher[1]), of_folder.st_uid)
+
+
+def _read_address(path: Path, folder: int, pid: int, owner: int) -> Iterator[RunningFlow | str]:
+    """The flow whose run folder is `path`, or what is wrong with its address; nothing while there is none."""
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK  # a pipe of that name would hold up its reader
+    with os.fdopen(os.open(ADDRESS, flags, dir_fd=folder), "rb") as file:
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode) or about.st_uid != owner:
+            return
+        text = file.read(LONGEST_ADDRESS + 1)
+    try:
+        written = msgspec.json.decode(text[:LONGEST_ADDRESS], type=RunningFlow)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        yield f"{path / ADDRESS}: is damaged, or not an address of a flow"
+        return
+    if not NAME.fullmatch(written.flow) or written.pid != pid:
+        yield f"{path / ADDRESS}: is not of this folder"
+    elif not _is_address_in(path, folder, owner, written.endpoint):
+        yield f"{path / ADDRESS}: {shown(written.endpoint)} is not an endpoint of this folder or of 127.0.0.1"
+    else:
+        yield RunningFlow(written.flow, pid, written.endpoint, _owner_name(owner))
+
+
+def _belongs_to(pid: int, owner: int) -> bool:
+    """Whether the process `pid` runs, as the user `owner`: else a folder could speak for another user's flow."""
+    try:
+        return int(psutil.Process(pid).uids().real) == owner
+    except psutil.Error:
+        return False
+
+
+def _is_address_in(path: Path, folder: int, owner: int, endpoint: str) -> bool:
+    """Whether tools may dial `endpoint` since it stands in the run folder `path`."""
+    if local := TCP.fullmatch(endpoint):
+        return 0 < int(local[1]) < 2**16
+    socket = Path(endpoint.removeprefix(SOCKETS))
+    if not endpoint.startswith(SOCKETS) or socket.parent != path:
+        return False
+    try:
+        found = os.stat(socket.name, dir_fd=folder, follow_symlinks=False)
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISSOCK(found.st_mode) and found.st_uid == owner
+
+
+def _owner_name(owner: int) -> str:
+    if owner == os.getuid():
+        return ""
+    try:
+        return pwd.getpwuid(owner).pw_name
+    except KeyError:
+        return f"uid {owner}"
+
+
+def _own_root() -> tuple[PrivateFolder, str]:
+    """The folder that holds this user's run folders, and why it is not the usual one, if it is not.
+
+    Where another user was first, a folder of another name is as good: tools find it by whose it is.
+    """
+    base = _base()
+    name = f"caneflow-{os.getuid()}"
+    remark = ""
+    try:
+        for path in (base / name, *sorted(base.glob(f"{name}-*"))):
+            try:
+                return PrivateFolder.at(path), remark
+            except NotOurs as error:
+                remark = remark or str(error)
+        return PrivateFolder.at(Path(tempfile.mkdtemp(prefix=f"{name}-", dir=base))), remark
+    except (OSError, DataflowError) as error:
+        raise DataflowError(f"{base / name}: is needed for the run ({error}); {OF_YOUR_OWN}") from error
+
+
+def _base() -> Path:
+    """Where this user's folder of runs lies, made when it is not there; raises DataflowError when it is of no use."""
+    try:
+        base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()).absolute()
+        for missing in [path for path in (base, *base.parents) if not path.exists()][::-1]:
+            PrivateFolder.at(missing).close()
+        mode = base.stat().st_mode
+    except OSError as error:
+        raise DataflowError(f"{error.filename or 'no temporary folder'}: {error.strerror}; {OF_YOUR_OWN}") from error
+    if mode & OTHERS_WRITE and not mode & stat.S_ISVTX:
+        raise DataflowError(
+            f"{base}: anybody may exchange folders in it (mode {stat.S_IMODE(mode):04o}, expected 1777); {OF_YOUR_OWN}"
+        )
+    return base
 
 
 def _roots() -> list[Path]:
     """Where flows may have been started: by this session, by one with another environment, by another user."""
-    roots = {_root(): None}
-    for base in (Path(tempfile.gettempdir()), Path("/tmp"), *Path("/run/user").glob("*")):  # noqa: S108 - looked at only
+    bases = [os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir(), "/tmp", "/run/caneflow"]  # noqa: S108 - looked at
+    with suppress(OSError):
+        bases += map(str, Path("/run/user").iterdir())
+    roots: dict[Path, None] = {}
+    for base in filter(None, bases):
         with suppress(OSError):  # that of another user
-            roots.update(dict.fromkeys(base.glob("caneflow-*")))
+            roots.update(dict.fromkeys(Path(base).absolute().glob("caneflow-*")))
     return list(roots)
 
 
-def state_folder(flow: str, machine: str, run: str) -> Path:
-    """Where snapshots outlive a launcher of this machine, for as long as the leader's run goes on."""
+def state_folder(flow: str, machine: str, run: str) -> PrivateFolder:
+    """Where snapshots outlive a launcher of this machine, for as long as the leader's run goes on.
+
+    Raises DataflowError when it is not this user's alone, or cannot be made.
+    """
     # systemd names a folder that outlives a reboot (StateDirectory=).
-    base = os.environ.get("STATE_DIRECTORY")
-    parent = (Path(base.partition(":")[0]) if base else _root()) / f"state-{flow}-{machine}"
-    path = parent / run
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    for other in parent.iterdir():
-        if other != path:
-            shutil.rmtree(other, ignore_errors=True)
-    return path
+    given = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    base = PrivateFolder.given(Path(given)) if given else _own_root()[0]
+    runs = base.child(f"state-{flow}-{machine}")
+    folder = runs.child(run)
+    for other in runs.names():
+        if other != run:
+            runs.remove(other)
+    return folder
 
 
-def remove_state_folder(path: Path) -> None:
+def remove_state_folder(folder: PrivateFolder) -> None:
     """Remove the snapshots of a run that ended in order."""
-    shutil.rmtree(path.parent, ignore_errors=True)
+    runs = folder.parent
+    if runs is not None and runs.parent is not None:
+        runs.parent.remove(runs.path.name)
 
 
-def _sweep() -> None:
+def _sweep(root: PrivateFolder) -> None:
     """Remove what launchers left that were killed."""
-    for path in _root().glob("*-*"):
-        pid = path.name.rpartition("-")[2]
-        if pid.isdigit() and not psutil.pid_exists(int(pid)):
-            shutil.rmtree(path, ignore_errors=True)
+    for name in root.names():
+        launcher = OF_PROCESS.fullmatch(name)
+        if launcher is not None and not Path("/proc", launcher[1]).exists():
+            root.remove_unused(name)
