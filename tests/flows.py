@@ -19,6 +19,7 @@ import pytest
 from caneflow.messages import Imu, RadarFrame, numbered, sample_key
 from caneflow.recording import Recording, RecordingWriter
 
+BOTH_LINKS = pytest.mark.parametrize("links", ["unix", "tcp"])  # of the fixture `links`: how a file's nodes are linked
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
 NODES = {
     "imu": "run: drivers.bno055",

@@ -36,6 +36,7 @@ def test_the_schema_knows_every_key_and_no_other() -> None:
         "rig",
         "machines",
         "router",
+        "links",
         "insecure",
         "nodes",
         "results",

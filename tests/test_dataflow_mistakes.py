@@ -120,7 +120,8 @@ nodes:
     lines = mistakes(folder, text)
 
     assert (
-        lines[0] == "2:1: colour: unknown key; allowed are flow, insecure, machines, nodes, results, rig, router, seed"
+        lines[0]
+        == "2:1: colour: unknown key; allowed are flow, insecure, links, machines, nodes, results, rig, router, seed"
     )
     assert lines[1] == "3:42: rig.hand_height: is 'tall'; it takes a number, above 0 (m, of the hand above ground)"
     assert re.match(r"5:14: nodes\.imu\.run: no program 'drivers\.nosuch' in .*drivers.*operators; ", lines[2])

@@ -310,6 +310,48 @@ def test_a_link_that_is_missing_on_this_machine_is_named(endpoint: str, monkeypa
     ]
 
 
+def unix(path: Path) -> str:
+    return f"unixsock-stream/{path}"
+
+
+def test_a_socket_that_is_missing_on_this_machine_is_named(endpoint: str, tmp_path: Path) -> None:
+    """As above, by Unix sockets: one that it should listen at, and two writers of which one has taken its link."""
+    import os
+
+    deaf, taken, alone = (unix(tmp_path / name) for name in ("1", "2", "3"))
+    me = msgspec.structs.replace(NODE, pid=os.getpid())
+    reader = msgspec.structs.replace(me, listen=(deaf,), connect=(taken, alone))
+    writers = [
+        msgspec.structs.replace(me, node=name, listen=(listen,), sent={"imu": 100}, rates={"imu": 100.0})
+        for name, listen in (("imu", taken), ("radar", alone))
+    ]
+    here = msgspec.structs.replace(STATUS, host=platform.node(), nodes=[reader, *writers])
+    with open_session(listen=[taken]), open_session(listen=[alone]), open_session(mode="client", connect=[taken]):
+        findings = findings_of(endpoint, here)
+    assert [finding.text for finding in findings if finding.state == "bad"] == [
+        "should listen on socket 1, and does not: its readers get nothing",
+        "dials radar on socket 3, without success",
+    ]
+    assert "listens on socket 2; linked to none" in [finding.text for finding in findings]
+
+
+def test_the_way_to_a_socket(tmp_path: Path) -> None:
+    path = tmp_path / "0"
+    (nobody,) = way_to(unix(path))
+    assert (nobody.state, nobody.text) == ("bad", "no answer: No such file or directory")
+    with open_session(listen=[unix(path)]):
+        (somebody,) = way_to(unix(path))
+    assert (somebody.state, somebody.text) == ("ok", "somebody listens")
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    (left,) = way_to(unix(path))
+    assert (left.state, left.text) == ("bad", "nobody listens: the flow was killed")
+    (strange,) = way_to("unixsock-stream/\0")
+    assert strange.state == "bad"
+    (too_long,) = way_to(unix(tmp_path / ("x" * 200)))
+    assert too_long.state == "bad"
+
+
 @pytest.mark.parametrize("parts_of_one", [True, False])
 def test_launchers_of_one_flow_on_one_machine_are_taken_as_one(
     endpoint: str, monkeypatch: pytest.MonkeyPatch, parts_of_one: bool

@@ -10,7 +10,18 @@ from pathlib import Path
 import pytest
 
 from caneflow.runtime.dataflow.loading import examine
-from tests.flows import CANEFLOW, NODES, Launched, free_port, launchers, results, spread_cane, wait_for, write_walk
+from tests.flows import (
+    BOTH_LINKS,
+    CANEFLOW,
+    NODES,
+    Launched,
+    free_port,
+    launchers,
+    results,
+    spread_cane,
+    wait_for,
+    write_walk,
+)
 from tests.networks import Network
 
 Launch = Callable[..., Launched]
@@ -81,10 +92,12 @@ def on_loopback(flow: str, tmp_path: Path, split: dict[str, str]) -> Path:
     return path
 
 
+@BOTH_LINKS
 def test_two_launchers_give_the_bytes_of_one(
-    flow: str, tmp_path: Path, walk: Path, undisturbed: dict[str, list[bytes]], launch: Launch
+    flow: str, tmp_path: Path, walk: Path, undisturbed: dict[str, list[bytes]], launch: Launch, links: str
 ) -> None:
     file = on_loopback(flow, tmp_path, SPLIT)
+    file.write_text(f"links: {links}\n{file.read_text()}")
     replay = ("--replay", walk, "--speed", "max")
     phone = launch("run", file, "--machine", "phone", *replay, "--record", tmp_path / "p.mcap", log=tmp_path / "p.log")
     gateway = launch("run", file, "--machine", "gateway", *replay, "--record", tmp_path / "g.mcap", log=tmp_path / "g")

@@ -19,7 +19,7 @@ from caneflow.messages.control import Counters
 from caneflow.recording import Recording
 from caneflow.runtime.hosts.links import open_session
 from caneflow.runtime.hosts.run_directory import running_flows
-from tests.flows import node_processes, write_walk
+from tests.flows import BOTH_LINKS, node_processes, write_walk
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -100,18 +100,24 @@ def flow(tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def cane(tmp_path: Path, flow: str) -> Path:
+def links() -> str:
+    """How the processes of a flow are linked, unless a test asks for both ways."""
+    return "unix"
+
+
+@pytest.fixture
+def cane(tmp_path: Path, flow: str, links: str) -> Path:
     path = tmp_path / "dataflow.yaml"
-    path.write_text(CANE.format(flow=flow))
+    path.write_text(f"links: {links}{CANE.format(flow=flow)}")
     return path
 
 
 @pytest.fixture
-def live(tmp_path: Path, flow: str) -> Path:
+def live(tmp_path: Path, flow: str, links: str) -> Path:
     (tmp_path / "ticker.py").write_text(TICKER)
     (tmp_path / "echo.py").write_text(ECHO)
     path = tmp_path / "live.yaml"
-    path.write_text(LIVE.format(flow=flow))
+    path.write_text(f"links: {links}{LIVE.format(flow=flow)}")
     return path
 
 
@@ -253,7 +259,9 @@ def test_a_loop_goes_on_with_stamps_and_numbers(
     assert spacing == {10_000_000}, "the next turn begins one sample after the last"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    ("links", "number"), [("unix", signal.SIGINT), ("tcp", signal.SIGINT), ("unix", signal.SIGHUP)]
+)
 def test_ctrl_c_and_a_lost_terminal_end_everything_in_order(
     live: Path, tmp_path: Path, start: Callable[..., Running], number: int
 ) -> None:
@@ -331,7 +339,7 @@ def test_what_is_for_its_output_alone_ends_with_its_reader(
     assert running.end(signal.SIGINT)[0] == 130
 
 
-@pytest.mark.parametrize("wait_for_ready", [True, False])
+@pytest.mark.parametrize(("links", "wait_for_ready"), [("unix", True), ("tcp", True), ("unix", False)])
 def test_a_killed_launcher_leaves_no_process(live: Path, start: Callable[..., Running], wait_for_ready: bool) -> None:
     running = start("run", live)
     if wait_for_ready:
@@ -343,6 +351,7 @@ def test_a_killed_launcher_leaves_no_process(live: Path, start: Callable[..., Ru
     wait_for(lambda: not running.nodes(), "the end of all nodes", deadline=5.0)
 
 
+@BOTH_LINKS
 def test_a_killed_node_of_a_live_run_comes_back_and_misses_nothing(live: Path, start: Callable[..., Running]) -> None:
     running = start("run", live)
     with running.session() as session:
@@ -361,6 +370,7 @@ def test_a_killed_node_of_a_live_run_comes_back_and_misses_nothing(live: Path, s
     assert "echo | ended with killed by SIGKILL; restart 1 of" in output
 
 
+@BOTH_LINKS
 def test_a_node_that_fails_for_good_ends_the_run(live: Path, tmp_path: Path) -> None:
     (tmp_path / "echo.py").write_text(ECHO.replace("yield", "raise RuntimeError('no more') #"))
     live.write_text(
@@ -479,6 +489,7 @@ def test_a_missing_program_is_found_before_anything_starts(live: Path, tmp_path:
     assert "Traceback" not in done.stderr
 
 
+@BOTH_LINKS
 def test_a_recording_cut_short_is_replayed_up_to_the_cut(cane: Path, walk: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(walk.read_bytes()[: walk.stat().st_size * 2 // 3])

@@ -162,6 +162,34 @@ def test_past_samples_are_granted_where_the_samples_are(name: str, records: bool
             assert {key for key in granted if key.startswith(history)} == past
 
 
+@pytest.mark.parametrize(("links", "own", "observed"), [("unix", ["unixsock-stream"], True), ("tcp", ["tcp"], False)])
+def test_within_a_machine_all_is_allowed_by_its_own_links_and_reading_by_others(
+    tmp_path: Path, links: str, own: list[str], observed: bool
+) -> None:
+    file = tmp_path / "flow.yaml"
+    file.write_text(spread_cane("cane", machines(), SPLIT, more=f"links: {links}\n"))
+    deployment = deploy(load(file), machine="gateway")
+    assert deployment.site is not None
+    control = access_control(deployment, deployment.site)
+    by_link = {tuple(each["link_protocols"]): each["id"] for each in control["subjects"] if "link_protocols" in each}
+    allowed = {
+        (policy["subjects"][0], flow, message)
+        for policy in control["policies"]
+        for rule in control["rules"]
+        if rule["id"] in policy["rules"]
+        for flow in rule["flows"]
+        for message in rule["messages"]
+    }
+
+    assert {("ingress", "put"), ("egress", "put"), ("ingress", "reply")} <= {
+        (flow, message) for who, flow, message in allowed if who == by_link[tuple(own)]
+    }
+    assert (("tcp",) in by_link and links == "unix") == observed
+    if observed:
+        may_say = {message for who, flow, message in allowed if who == by_link["tcp",] and flow == "ingress"}
+        assert may_say == {"declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"}
+
+
 def broken(change: Callable[[dict[str, Any]], None], tmp_path: Path) -> dict[str, Any]:
     file = tmp_path / "flow.yaml"
     file.write_text(spread_cane("cane", machines(), SPLIT))

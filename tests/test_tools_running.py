@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,7 @@ if __name__ == "__main__":
 
 FLOW = """
 flow: {flow}
+links: {links}
 nodes:
   source: {{run: ./source.py}}
   gaps:
@@ -93,11 +94,30 @@ results: [gaps/imu, full/imu, late/imu, bad/imu]
 @pytest.fixture(scope="module")
 def flow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The name of a flow that runs."""
-    folder = tmp_path_factory.mktemp("flow")
+    with running(tmp_path_factory.mktemp("flow"), "unix") as name:
+        yield name
+
+
+@pytest.fixture(scope="module")
+def flow_over_tcp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The name of another one, whose nodes are linked by TCP."""
+    with running(tmp_path_factory.mktemp("tcp"), "tcp") as name:
+        yield name
+
+
+@pytest.fixture(params=["flow", "flow_over_tcp"])
+def either_flow(request: pytest.FixtureRequest) -> str:
+    """The names of both, in turn."""
+    name: str = request.getfixturevalue(request.param)
+    return name
+
+
+@contextmanager
+def running(folder: Path, links: str) -> Iterator[str]:
     name = "t" + re.sub(r"\W", "", str(folder)).lower()[-40:]
     (folder / "source.py").write_text(SOURCE)
     (folder / "join.py").write_text(JOIN)
-    (folder / "flow.yaml").write_text(FLOW.format(flow=name))
+    (folder / "flow.yaml").write_text(FLOW.format(flow=name, links=links))
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
             [*CANEFLOW, "run", str(folder / "flow.yaml"), "--record", str(folder / "out.mcap"), "--record-last", "60s"],
@@ -182,7 +202,8 @@ def test_losses_are_counted_exactly_where_they_happen(flow: str) -> None:
         assert edge_of(here.status(), "bad.a").sent == 3
 
 
-def test_status_as_json(caneflow: Callable[..., Run], flow: str) -> None:
+def test_status_as_json(caneflow: Callable[..., Run], either_flow: str) -> None:
+    flow = either_flow
     with attached(flow) as here:  # rates take two counts
         wait_for(lambda: edge_of(here.status(), "gaps.a").rate, "a rate")
         wait_for(lambda: here.status().nodes[0].rates["tick"], "the writer's")
@@ -244,7 +265,8 @@ def test_hz_for_people(caneflow: Callable[..., Run], flow: str) -> None:
     assert re.search(r"^source/tick +\d+ +\d+\.\d\d ", out, re.MULTILINE)
 
 
-def test_echo_prints_samples_as_they_are_on_the_wire(caneflow: Callable[..., Run], flow: str) -> None:
+def test_echo_prints_samples_as_they_are_on_the_wire(caneflow: Callable[..., Run], either_flow: str) -> None:
+    flow = either_flow
     status, out, _ = caneflow("echo", flow, "source/tick", "--count", 2)
     assert status == 0
     assert len(out.splitlines()) == 2
@@ -296,13 +318,14 @@ def test_the_last_seconds_are_written_when_asked_for(caneflow: Callable[..., Run
     assert re.fullmatch(r".*out_002\.mcap: \d+ samples, \d+\.\d s\n", caneflow("record", "--now", flow)[1])
 
 
-def test_the_doctor_of_a_flow_that_is_well(caneflow: Callable[..., Run], flow: str) -> None:
+def test_the_doctor_of_a_flow_that_is_well(caneflow: Callable[..., Run], either_flow: str) -> None:
+    flow = either_flow
     status, out, err = caneflow("doctor", flow, "--json")
     found = json.loads(out)
     assert (status, err) == (0, ""), [finding for finding in found if finding["state"] == "bad"]
     links = {finding["node"]: finding["text"] for finding in found if "linked to" in finding["text"]}
     assert set(links) == {"source", "gaps", "full", "late", "bad", "recorder"}
-    assert re.fullmatch(r"listens on port \d+; linked to the launcher", links["source"])
+    assert re.fullmatch(r"listens on (port|socket) \d+; linked to the launcher", links["source"])
     assert links["full"].endswith("; linked to the launcher, source")
 
 

@@ -6,7 +6,7 @@ import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 
@@ -17,7 +17,7 @@ from caneflow.messages.rig import overlaid, read_rig
 from caneflow.recording import Recording
 from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.links import Ports
+from caneflow.runtime.hosts.links import Ports, Sockets
 from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
 from caneflow.runtime.wording import did_you_mean, listed
 
@@ -69,6 +69,8 @@ class Deployment:
     plans: dict[str, NodePlan]
     origin: int = 0  # ns: the stamp at which a replay begins
     site: Site | None = None  # when the flow runs on several machines
+    door: Site | None = None  # when it runs on one, and others may listen there
+    links: Literal["unix", "tcp"] = "unix"  # between the processes of this machine
 
     @property
     def replay(self) -> bool:
@@ -147,7 +149,8 @@ def deploy(
         plans[name] = msgspec.structs.replace(plan, settings={**plan.settings, **(recorder or {})})
         site = _with_recorder_on(site, machine) if site and machine else site
     plans = {name: _with_readers(plan, plans, whole_rig, replay is not None) for name, plan in plans.items()}
-    return Deployment(flow=graph.flow, plans=plans, origin=origin, site=site)
+    door = _door(graph) if site is None and (machine is not None or replay is None) else None
+    return Deployment(flow=graph.flow, plans=plans, origin=origin, site=site, door=door, links=graph.links)
 
 
 def with_recorders_on(deployment: Deployment, machines: Iterable[str]) -> Deployment:
@@ -164,7 +167,7 @@ def with_recorders_on(deployment: Deployment, machines: Iterable[str]) -> Deploy
     return replace(deployment, plans=plans, site=site)
 
 
-def linked(deployment: Deployment, ports: Ports, launcher: str) -> Deployment:
+def linked(deployment: Deployment, ports: Ports | Sockets, launcher: str) -> Deployment:
     """The same with an endpoint for every writer here: readers dial writers, everybody dials the launcher."""
     here = {name: plan for name, plan in deployment.plans.items() if deployment.runs_here(name)}
     endpoints = {name: ports.endpoint() for name, plan in here.items() if any(map(here.get, plan.readers))}
@@ -216,6 +219,16 @@ def _site(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | None:
         recorders=frozenset(name for name in used if graph.machines[name].records),
         insecure=graph.insecure,
     )
+
+
+def _door(graph: Graph) -> Site | None:
+    """Where the only machine of the graph listens for others; None: nowhere."""
+    used = list({node.machine: None for node in graph.nodes.values()})
+    if len(used) != 1 or used[0] is None or not graph.machines[used[0]].listen:
+        return None
+    name, places = used[0], dict.fromkeys(graph.nodes, used[0])
+    listen = graph.machines[name].listen
+    return Site(name=name, leader=name, others=(), places=places, listen=listen, connect=(), insecure=graph.insecure)
 
 
 def recorder_name(machine: str | None) -> str:

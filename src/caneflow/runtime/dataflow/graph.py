@@ -86,6 +86,7 @@ class Graph:
     path: Path
     router: str | None = None  # the endpoint of a Zenoh router that every machine dials
     insecure: bool = False  # machines talk in the clear, with whoever reaches them
+    links: Literal["unix", "tcp"] = "unix"  # between the processes of one machine
     leader: str | None = None  # the machine whose launcher starts and ends the others; None: there is only one
     warnings: tuple[str, ...] = field(default=())
 

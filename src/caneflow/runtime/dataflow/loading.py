@@ -98,6 +98,7 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
         path=path,
         router=flow.router,
         insecure=flow.insecure,
+        links=flow.links,
         leader=layout.leader,
         warnings=tuple(map(str, _sorted(document))),
     )

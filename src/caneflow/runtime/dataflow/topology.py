@@ -72,9 +72,9 @@ def check_machines(document: Document, flow: FlowShape, parts: Mapping[str, Part
         for name in flow.machines
     }
     if flow.insecure:
-        document.problem(
-            ("insecure",), "machines talk in the clear: whoever reaches them reads and writes everything", warning=True
-        )
+        alone = len(used) <= 1 and flow.links != "tcp"  # then it listens for those who only read
+        rights = "reads everything" if alone else "reads and writes everything"
+        document.problem(("insecure",), f"machines talk in the clear: whoever reaches them {rights}", warning=True)
     return Layout(places, leader if len(used) > 1 else None, links)
 
 

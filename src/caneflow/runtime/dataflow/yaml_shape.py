@@ -22,6 +22,7 @@ ENDPOINT_PATTERN = r"^tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}$"
 ALL_LENGTH = 4096  # samples that may wait on an input that takes `all`: 40 s at 100 Hz
 
 Policy = Literal["never", "on-failure", "always"]
+LocalLinks = Literal["unix", "tcp"]
 
 Name = Annotated[str, Field(pattern=NAME_PATTERN, description=NAME_RULE)]
 Stream = Annotated[str, Field(pattern=STREAM_PATTERN, examples=["radar/frame"])]
@@ -82,7 +83,10 @@ class RestartShape(Shape):
 class MachineShape(Shape):
     """One computer: where it is reached, and whom it dials."""
 
-    listen: Annotated[list[Endpoint], Field(description="where other machines reach it")] = []
+    listen: Annotated[
+        list[Endpoint],
+        Field(description="where other machines reach it; where it is the only machine, programs that only read"),
+    ] = []
     connect: Annotated[
         list[Endpoint], Field(description="whom it dials: for each pair of machines, one of the two does")
     ] = []
@@ -173,6 +177,13 @@ class FlowShape(Shape):
         Endpoint | None,
         Field(description="a Zenoh router (zenohd) that every machine dials; they need no links with each other then"),
     ] = None
+    links: Annotated[
+        LocalLinks,
+        Field(
+            description="between the processes of one machine: `unix`, sockets in a folder that only this user can "
+            "enter; `tcp`, ports on 127.0.0.1, which every user of the machine can reach"
+        ),
+    ] = "unix"
     insecure: Annotated[
         bool, Field(description="machines talk in the clear, with whoever reaches them; else with keys only")
     ] = False

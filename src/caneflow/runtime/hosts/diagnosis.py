@@ -30,7 +30,7 @@ from caneflow.runtime.hosts.attach import (
     observer_credentials,
     timed_statuses,
 )
-from caneflow.runtime.hosts.links import open_session
+from caneflow.runtime.hosts.links import UNIX, open_session
 from caneflow.runtime.hosts.observations import OLD, OTHER_CLOCK
 from caneflow.runtime.wording import listed, one_line
 
@@ -96,6 +96,9 @@ TO_FIND_A_FLOW = (
 def way_to(endpoint: str, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
     """Whether somebody listens at `endpoint`, and takes this side's certificate; a finding that is bad is the last."""
     protocol, _, address = endpoint.partition("/")
+    if protocol == UNIX:
+        yield _way_to_socket(endpoint, address)
+        return
     host, _, port = address.rpartition(":")
     if not (protocol and host and port.isdigit()):
         text = f"{endpoint} is no endpoint"
@@ -110,6 +113,26 @@ def way_to(endpoint: str, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
         yield Finding(node=endpoint, state="ok", text="somebody listens")
         if protocol == "tls":
             yield _handshake(endpoint, host, link, keys)
+
+
+def _way_to_socket(endpoint: str, path: str) -> Finding:
+    """Whether somebody listens at a Unix socket of this machine."""
+    attempts: tuple[str, ...] = ("end the flow and start it again", "it is in the run's folder: was that removed?")
+    try:
+        with socket.socket(socket.AF_UNIX) as link:
+            link.settimeout(DIAL_TIMEOUT)
+            link.connect(path)
+    except PermissionError:
+        text, attempts = "belongs to another user", ("a flow is reached by its own user, and by root",)
+    except ConnectionRefusedError:
+        text, attempts = "nobody listens: the flow was killed", ("start it again",)
+    except OSError as error:
+        text = f"no answer: {error.strerror or error}"
+    except ValueError as error:
+        text = f"not a path: {error}"
+    else:
+        return Finding(node=endpoint, state="ok", text="somebody listens")
+    return Finding(node=endpoint, state="bad", text=text, attempts=attempts)
 
 
 def _no_way(endpoint: str, host: str, port: str, error: OSError) -> Finding:
@@ -256,27 +279,59 @@ def _nodes(session: zenoh.Session, status: FlowStatus) -> Iterator[Finding]:
 def _links(node: NodeStatus, status: FlowStatus) -> Iterator[Finding]:
     """Whether each link that the node should have is there: only the machine itself can tell."""
     try:
-        sockets = psutil.Process(node.pid).net_connections(kind="tcp") if node.pid else []
+        listening, dialled = _endpoints_of(node.pid)
+        dialled |= {endpoint for endpoint in node.connect if _takes_all(endpoint, status)}
     except psutil.Error:
         return  # somebody else's process, or it has just ended
-    listening = {each.laddr.port for each in sockets if each.status == psutil.CONN_LISTEN}
-    dialled = {each.raddr.port for each in sockets if each.status == psutil.CONN_ESTABLISHED and each.raddr}
-    listeners = {port: other.node for other in status.nodes for port in _ports(other.listen)}
-    for port in _ports(node.listen):
-        if port not in listening:
-            text = f"should listen on port {port}, and does not: its readers get nothing"
+    listeners = {endpoint: other.node for other in status.nodes for endpoint in other.listen}
+    for endpoint in node.listen:
+        if endpoint not in listening:
+            text = f"should listen on {_shown(endpoint)}, and does not: its readers get nothing"
             yield Finding(node=node.node, state="bad", text=text, attempts=("end the flow and start it again",))
-    missing = [port for port in _ports(node.connect) if port not in dialled]
-    for port in missing:
-        whom = listeners.get(port, "its launcher")
-        text = f"dials {whom} on port {port}, without success"
-        attempts = (f"is {whom} ready? it is dialled again every 0.2 s", "a firewall on loopback? sudo iptables -L")
+    missing = [endpoint for endpoint in node.connect if endpoint not in dialled]
+    for endpoint in missing:
+        whom = listeners.get(endpoint, "its launcher")
+        text = f"dials {whom} on {_shown(endpoint)}, without success"
+        stands = (
+            "is the run's folder there? sockets in a removed one cannot be dialled"
+            if endpoint.startswith(f"{UNIX}/")
+            else "a firewall on loopback? sudo iptables -L"
+        )
+        attempts = (f"is {whom} ready? it is dialled again every 0.2 s", stands)
         yield Finding(node=node.node, state="bad", text=text, attempts=attempts)
-    up = [listeners.get(port, "the launcher") for port in _ports(node.connect) if port in dialled]
+    up = [listeners.get(endpoint, "the launcher") for endpoint in node.connect if endpoint in dialled]
     if not missing:
-        ports = ", ".join(map(str, _ports(node.listen)))
-        text = f"{f'listens on port {ports}; ' if ports else ''}linked to {listed(up)}"
+        places = ", ".join(map(_shown, node.listen))
+        text = f"{f'listens on {places}; ' if places else ''}linked to {listed(up)}"
         yield Finding(node=node.node, state="ok", text=text)
+
+
+def _endpoints_of(pid: int) -> tuple[set[str], set[str]]:
+    """Where a process listens, and which ports it has dialled; which Unix sockets it has, the kernel does not list."""
+    if not pid:
+        return set(), set()
+    sockets = psutil.Process(pid).net_connections(kind="tcp")
+    listening = {f"tcp/127.0.0.1:{each.laddr.port}" for each in sockets if each.status == psutil.CONN_LISTEN}
+    dialled = {
+        f"tcp/127.0.0.1:{each.raddr.port}" for each in sockets if each.status == psutil.CONN_ESTABLISHED and each.raddr
+    }
+    return listening | {f"{UNIX}/{path}" for path in _unix_paths(pid)}, dialled
+
+
+def _takes_all(endpoint: str, status: FlowStatus) -> bool:
+    """Whether as many links as there should be have been taken at a Unix socket."""
+    if not endpoint.startswith(f"{UNIX}/"):
+        return False
+    listener = next((node.pid for node in status.nodes if endpoint in node.listen), status.pid)
+    expected = sum(endpoint in node.connect for node in status.nodes if node.pid)
+    # The socket that listens, and one for each link that it has taken.
+    return _unix_paths(listener).count(endpoint.partition("/")[2]) > expected
+
+
+def _unix_paths(pid: int) -> list[str]:
+    """The paths of a process's Unix sockets, each as often as there is one."""
+    paths = [str(each.laddr) for each in psutil.Process(pid).net_connections(kind="unix")] if pid else []
+    return [path for path in paths if path]
 
 
 def _edges(session: zenoh.Session, answers: Sequence[FlowStatus]) -> Iterator[Finding]:
@@ -338,5 +393,10 @@ def _is_matched(session: zenoh.Session, key: str) -> bool:
     return matched
 
 
-def _ports(endpoints: Sequence[str]) -> list[int]:
-    return [int(port) for each in endpoints if (port := each.rpartition(":")[2]).isdigit()]
+def _shown(endpoint: str) -> str:
+    """An endpoint of this machine, in short."""
+    return (
+        f"socket {endpoint.rpartition('/')[2]}"
+        if endpoint.startswith(f"{UNIX}/")
+        else f"port {endpoint.rpartition(':')[2]}"
+    )

@@ -29,7 +29,7 @@ from caneflow.runtime.hosts import last_words
 from caneflow.runtime.hosts.clocks import Answer, Clocks
 from caneflow.runtime.hosts.congestion import closing_at_once, launcher_ids, node_id, node_ids, tool_links
 from caneflow.runtime.hosts.last_words import LastWords
-from caneflow.runtime.hosts.links import Ports, open_session, protocol
+from caneflow.runtime.hosts.links import local_links, open_session, protocol
 from caneflow.runtime.hosts.machines import (
     LINK_SETTINGS,
     Began,
@@ -46,7 +46,7 @@ from caneflow.runtime.hosts.private_folder import PrivateFolder
 from caneflow.runtime.hosts.processes import Exited, Line, NurseryLost, Processes
 from caneflow.runtime.hosts.restarts import Again, How, Restarts
 from caneflow.runtime.hosts.run_directory import RunDirectory, remove_state_folder, state_folder
-from caneflow.runtime.hosts.security import links_between
+from caneflow.runtime.hosts.security import links_between, open_door
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.stages.merge import BEGIN, END
 
@@ -177,33 +177,30 @@ class Launcher:
         self._outcome = Outcome()
         self._state_folder: PrivateFolder | None = None
         self._observed = Observations()
+        self._said_removed = False
 
     def run(self) -> Outcome:
         """Start everything, follow it to its end, end everything."""
-        ports = Ports()
-        try:
-            endpoint = ports.endpoint()
-            with (
-                RunDirectory(self._deployment.flow) as self._directory,
-                self._open_session(endpoint) as self._session,
-                self._subscribed(),
-                self._directory.announced(endpoint),  # tools may attach from here on
-                Processes(self._events, self._nursery) as self._processes,
-                self._signals(),
-            ):
-                if self._directory.remark:
-                    self._report(LAUNCHER, f"{self._directory.remark}; this run is in {self._directory.path}")
-                if self._gather():
-                    self._take_nodes(linked(self._deployment, ports, endpoint))
-                    for node in self._nodes.values():
-                        if node.here:
-                            self._start(node)
-                    self._follow()
-                self._part()
-                self._stop()
-                self._let_others_leave()
-        finally:
-            ports.release()
+        with (
+            RunDirectory(self._deployment.flow) as self._directory,
+            local_links(self._deployment.links, self._directory.path) as ports,
+            self._open_session(endpoint := ports.endpoint()) as self._session,
+            self._subscribed(),
+            self._directory.announced(endpoint),  # tools may attach from here on
+            Processes(self._events, self._nursery) as self._processes,
+            self._signals(),
+        ):
+            if self._directory.remark:
+                self._report(LAUNCHER, f"{self._directory.remark}; this run is in {self._directory.path}")
+            if self._gather():
+                self._take_nodes(linked(self._deployment, ports, endpoint))
+                for node in self._nodes.values():
+                    if node.here:
+                        self._start(node)
+                self._follow()
+            self._part()
+            self._stop()
+            self._let_others_leave()
         self._conclude()
         return self._outcome
 
@@ -214,8 +211,9 @@ class Launcher:
         here = filter(deployment.runs_here, deployment.plans)
         own = [each for node in here for each in node_ids(self._run, node)]
         if site is None:
-            more = tool_links(deployment.flow, [protocol(endpoint)], own, replay=deployment.replay)
-            return open_session(listen=[endpoint], replay=deployment.replay, more=more)
+            door, secured = open_door(deployment, self._keys)
+            more = tool_links(deployment.flow, map(protocol, (endpoint, *door)), own, replay=deployment.replay)
+            return open_session(listen=[endpoint, *door], replay=deployment.replay, more={**secured, **more})
         site, secured = links_between(deployment, site, self._keys)
         own += [each for machine in site.others for each in launcher_ids(deployment.flow, machine)]
         strangers = map(protocol, (endpoint, *site.listen))
@@ -367,6 +365,7 @@ class Launcher:
         while not (self._is_over() or self._all_ended()):
             for event in self._next_events():
                 self._take(event)
+            self._look_at_folder()
             self._look_at_deadlines()
             self._open_window()
             if self._clocks is not None:
@@ -544,6 +543,10 @@ class Launcher:
             plan = msgspec.structs.replace(plan, settings={**plan.settings, "goes_on": True})
         identity = node_id(self._run, plan.node, node.restarts)
         plan = msgspec.structs.replace(plan, links=msgspec.structs.replace(plan.links, identity=identity))
+        if self._deployment.links == "unix" and not self._directory.is_there:
+            cause = f"cannot be started: the run's folder {folder}, where its links would be, was removed"
+            self._restart_or_fail(node, cause, How.LASTING, None)
+            return
         node.state, node.last_words = "starting", None
         node.started_at = time.monotonic()
         try:
@@ -551,6 +554,17 @@ class Launcher:
             node.pid = self._processes.start(plan.node, arguments, plan.encoded(), called)
         except OSError as error:
             self._restart_or_fail(node, f"cannot be started: {error.strerror}", How.STOPPED, None)
+
+    def _look_at_folder(self) -> None:
+        """Say once that the folder of the run was removed, as cleaners do: links that are there go on."""
+        if not (self._said_removed or self._directory.is_there):
+            self._said_removed = True
+            lost = (
+                "tools cannot attach any more, and a node that ends cannot start again"
+                if self._deployment.links == "unix"
+                else "tools cannot find it by its name any more"
+            )
+            self._report(LAUNCHER, f"{self._directory.path} was removed: the flow goes on, but {lost}")
 
     def _look_at_deadlines(self) -> None:
         now = time.monotonic()

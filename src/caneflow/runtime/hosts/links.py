@@ -11,8 +11,9 @@ import random
 import socket
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from threading import get_ident
-from typing import Any
+from typing import Any, Literal
 
 import zenoh
 
@@ -47,6 +48,9 @@ THREADS = {  # read once by Zenoh, when the first session of a process opens
 LOGGED = "error,zenoh::net::routing::hat=off,zenoh::net::routing::dispatcher=off"
 RETRY = {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2}
 SENT_AT_BYTES = 8  # of a sample's attachment: ns, little-endian
+UNIX = "unixsock-stream"  # Zenoh's word for Unix sockets
+LONGEST_PATH = 99  # bytes of a Unix socket's; Linux takes 107
+MOST_SOCKETS = 9_999  # of one run
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ports, so that no outgoing connection takes one
 
 
@@ -139,6 +143,12 @@ class Ports:
     def __init__(self) -> None:
         self._reservations: list[socket.socket] = []
 
+    def __enter__(self) -> "Ports":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
     def endpoint(self) -> str:
         """A loopback endpoint that nobody listens on."""
         for port in random.sample(PORTS, k=200):  # spreads flows over the ports; nothing secret
@@ -165,3 +175,40 @@ class Ports:
             return False
         self._reservations.append(reservation)
         return True
+
+
+class Sockets:
+    """Unix sockets for the processes of one run, in its private folder: nobody else on this machine can dial them."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises DataflowError when the sockets of `folder` cannot have names that Zenoh takes."""
+        self._folder = folder
+        self._number = 0
+        longest = len(os.fsencode(folder / str(MOST_SOCKETS)))
+        if longest > LONGEST_PATH:
+            raise DataflowError(
+                f"{folder}: too long for Unix sockets in it ({longest} bytes with a number, at most {LONGEST_PATH}); "
+                "set XDG_RUNTIME_DIR to a shorter folder of your own, or write `links: tcp` in the file"
+            )
+        if any(letter in "?#" or not letter.isprintable() for letter in str(folder)):
+            raise DataflowError(
+                f"{str(folder)!a}: a folder of Unix sockets may have no ?, # or control character in its name; "
+                "set XDG_RUNTIME_DIR to another folder of your own, or write `links: tcp` in the file"
+            )
+
+    def __enter__(self) -> "Sockets":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is reserved: they go with their folder."""
+
+    def endpoint(self) -> str:
+        """The endpoint of a socket that nobody listens on."""
+        path = self._folder / str(self._number)
+        self._number += 1
+        return f"{UNIX}/{path}"
+
+
+def local_links(links: Literal["unix", "tcp"], folder: Path) -> Ports | Sockets:
+    """Endpoints for the links between the processes of one run, whose folder is `folder`."""
+    return Sockets(folder) if links == "unix" else Ports()

@@ -23,6 +23,10 @@ ATTEMPTS = 5  # at a folder that a cleaner removes between its making and its lo
 class NotOurs(DataflowError):
     """The folder belongs to another user, is open to others, or is a link."""
 
+    def __init__(self, message: str, *, suspicious: bool = True) -> None:
+        super().__init__(message)
+        self.suspicious = suspicious  # False: others may read it; nobody else can have put anything there
+
 
 class PrivateFolder:
     """A folder of mode 0700 that belongs to this user, held open.
@@ -135,7 +139,7 @@ def _held(path: Path, name: str, parent: int | None, *, strict: bool) -> int:
         try:
             found = os.fstat(descriptor)
             if wrong := _wrong(found, OTHERS if strict else OTHERS_WRITE):
-                raise NotOurs(f"{path}: {wrong}")
+                raise NotOurs(f"{path}: {wrong}", suspicious=bool(_wrong(found, OTHERS_WRITE)))
             if found.st_mode & OTHERS:
                 os.fchmod(descriptor, 0o700)
             with suppress(OSError):  # some file systems have no locks

@@ -18,6 +18,7 @@ import psutil
 
 from caneflow.messages import NAME
 from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.hosts.links import UNIX
 from caneflow.runtime.hosts.private_folder import NotOurs, PrivateFolder, folder_of_user
 from caneflow.runtime.wording import shown
 
@@ -25,7 +26,6 @@ ADDRESS = "flow.json"
 LONGEST_ADDRESS = 4096  # bytes of flow.json
 SHOWN_OF_FLOW = 20  # letters of the flow's name in the run folder's: paths of sockets are short
 OTHERS_WRITE = 0o002
-SOCKETS = "unixsock-stream/"  # Zenoh's word for Unix sockets
 TCP = re.compile(r"tcp/127\.0\.0\.1:([0-9]{1,5})")
 OF_YOUR_OWN = "set XDG_RUNTIME_DIR to a folder of your own"
 OF_PROCESS = re.compile(r".*-([0-9]{1,10})")  # the name of a run folder, with the launcher's pid
@@ -48,6 +48,7 @@ class RunDirectory:
 
     def __init__(self, flow: str) -> None:
         self._flow = flow
+        self._socket: Path | None = None  # where tools attach, with Unix sockets
         self._name = f"{flow[:SHOWN_OF_FLOW]}-{os.getpid()}"
         self.remark = ""  # why the run is not in the usual place, if it is not
 
@@ -67,6 +68,8 @@ class RunDirectory:
     @contextmanager
     def announced(self, endpoint: str) -> Iterator[None]:
         """Tell tools that they may attach to `endpoint`, while the block lasts."""
+        if endpoint.startswith(f"{UNIX}/"):
+            self._socket = Path(endpoint.removeprefix(f"{UNIX}/"))
         running = {"flow": self._flow, "pid": os.getpid(), "endpoint": endpoint}
         self._folder.write(ADDRESS, msgspec.json.encode(running))
         try:
@@ -76,8 +79,8 @@ class RunDirectory:
 
     @property
     def is_there(self) -> bool:
-        """Whether the folder is where it was made: a cleaner may have removed it."""
-        return self._folder.is_there
+        """Whether the folder and the launcher's socket are where they were made: a cleaner may have removed them."""
+        return self._folder.is_there and (self._socket is None or self._socket.exists())
 
 
 def running_flows() -> list[RunningFlow]:
@@ -138,8 +141,8 @@ def _is_address_in(path: Path, folder: int, owner: int, endpoint: str) -> bool:
     """Whether tools may dial `endpoint` since it stands in the run folder `path`."""
     if local := TCP.fullmatch(endpoint):
         return 0 < int(local[1]) < 2**16
-    socket = Path(endpoint.removeprefix(SOCKETS))
-    if not endpoint.startswith(SOCKETS) or socket.parent != path:
+    socket = Path(endpoint.removeprefix(f"{UNIX}/"))
+    if not endpoint.startswith(f"{UNIX}/") or socket.parent != path:
         return False
     try:
         found = os.stat(socket.name, dir_fd=folder, follow_symlinks=False)
@@ -158,7 +161,7 @@ def _owner_name(owner: int) -> str:
 
 
 def _own_root() -> tuple[PrivateFolder, str]:
-    """The folder that holds this user's run folders, and why it is not the usual one, if it is not.
+    """The folder that holds this user's run folders, and why it is not the usual one, if that is to be known.
 
     Where another user was first, a folder of another name is as good: tools find it by whose it is.
     """
@@ -170,7 +173,8 @@ def _own_root() -> tuple[PrivateFolder, str]:
             try:
                 return PrivateFolder.at(path), remark
             except NotOurs as error:
-                remark = remark or str(error)
+                if error.suspicious:  # and not one that a version before this made
+                    remark = remark or str(error)
         return PrivateFolder.at(Path(tempfile.mkdtemp(prefix=f"{name}-", dir=base))), remark
     except (OSError, DataflowError) as error:
         raise DataflowError(f"{base / name}: is needed for the run ({error}); {OF_YOUR_OWN}") from error

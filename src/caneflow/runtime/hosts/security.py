@@ -1,7 +1,8 @@
 """What a machine may send to another: mutual TLS says who it is, access control what it may do. Default deny.
 
 The rules come from the graph. Each launcher holds them against what comes in and against what goes out, so a
-machine that was taken over can neither write what is not its own nor read what it has no use for.
+machine that was taken over can neither write what is not its own nor read what it has no use for. Within a machine
+the run's private folder says who it is: its sockets are for this user alone.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,11 +15,12 @@ from caneflow.runtime.dataflow.topology import is_open
 from caneflow.runtime.deployment import Deployment, Site, recorder_name
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.certificates import OBSERVER, ROUTER, Credentials, credentials
+from caneflow.runtime.hosts.links import UNIX
 
 Grants: TypeAlias = dict[str, list[str]]  # by kind of message the keys
 
 NODES_WORDS = ("progress", "marks", "counters")  # what a node says of itself, under `@/<word>/<node>`
-LOCAL = "tcp"  # the links within a machine; those between machines are TLS
+LOCAL = {"unix": UNIX, "tcp": "tcp"}  # by the file's `links` Zenoh's word for those within a machine
 KINDS = (
     "put",
     "delete",
@@ -69,13 +71,35 @@ def links_between(deployment: Deployment, site: Site, keys: Path | None) -> tupl
             raise DataflowError(f"--record: {site.name} may not read every stream; write machines.{site.name}.records")
         behind_tls = replace(site, listen=tuple(map(tls, site.listen)), connect=tuple(map(tls, site.connect)))
         return behind_tls, secured_links(deployment, site, own)
+    _require_keys(site, keys)
+    return site, {}
+
+
+def open_door(deployment: Deployment, keys: Path | None) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Where the only machine of a flow listens for those who only read, and Zenoh's settings for it.
+
+    With keys they show an observer's certificate. Raises DataflowError as `links_between` does.
+    """
+    site = deployment.door
+    if site is None:
+        return (), {}
+    own = None if site.insecure or keys is None else credentials(keys, site.name)
+    if own is not None:
+        return tuple(map(tls, site.listen)), secured_links(deployment, site, own)
+    _require_keys(site, keys)
+    control = access_control(deployment, site)
+    check_access_control(control)
+    return site.listen, {"access_control": control}
+
+
+def _require_keys(site: Site, keys: Path | None) -> None:
+    """Raise DataflowError when a link would lead beyond this computer in the clear, and the file does not say so."""
     beyond = [endpoint for endpoint in (*site.listen, *site.connect) if is_open(endpoint)]
     if beyond and not site.insecure:
         raise DataflowError(
             f"{site.name}: no keys for {beyond[0]} in {keys}; `caneflow keys init` and `caneflow keys add {site.name}` "
             "make them (or write `insecure: true` for a network that only you are in)"
         )
-    return site, {}
 
 
 def access_control(deployment: Deployment, site: Site) -> dict[str, Any]:
@@ -90,11 +114,10 @@ def access_control(deployment: Deployment, site: Site) -> dict[str, Any]:
         ways = list(both_ways.values())
         both_ways[ROUTER] = (_together(comes for comes, _ in ways), _together(goes for _, goes in ways))
     control = _default_deny(both_ways)
-    everything = dict.fromkeys(KINDS, _everything(deployment.flow))
-    rules = _rules("everything", everything, everything)
-    control["rules"] += rules
-    control["subjects"].append({"id": "here", "link_protocols": [LOCAL]})
-    control["policies"].append({"subjects": ["here"], "rules": [rule["id"] for rule in rules]})
+    everything = dict.fromkeys(KINDS, _everything("*"))
+    _allow(control, "this machine", {"link_protocols": [LOCAL[deployment.links]]}, everything, everything)
+    if deployment.links != "tcp":  # where it is not the flow's own, who comes by it is nobody in particular
+        _allow(control, "anybody by TCP", {"link_protocols": ["tcp"]}, *both_ways[OBSERVER])
     return control
 
 
@@ -159,17 +182,18 @@ def machine_grants(deployment: Deployment, site: Site, sender: str, receiver: st
 def observer_grants(flow: str) -> tuple[Grants, Grants]:
     """What an observer may send, and what may be sent to it: it reads everything and writes nothing."""
     everything = _everything(flow)
+    status = [control_key(flow, "status"), control_key("*", "status")]  # of it, or of the one that answers
     asks: Grants = {
         "declare_subscriber": everything,
-        "query": [control_key(flow, "status")],
+        "query": status,
         "declare_liveliness_subscriber": everything,
         "liveliness_query": everything,
     }
     gets: Grants = {
         "put": everything,
         "delete": everything,
-        "declare_queryable": [control_key(flow, "status")],
-        "reply": [control_key(flow, "status")],
+        "declare_queryable": status,
+        "reply": status,
         "liveliness_token": everything,
     }
     return asks, gets
@@ -227,11 +251,16 @@ def _default_deny(both_ways: Mapping[str, tuple[Grants, Grants]]) -> dict[str, A
         "policies": [],
     }
     for name, (comes, goes) in both_ways.items():
-        rules = _rules(name, comes, goes)
-        control["rules"] += rules
-        control["subjects"].append({"id": name, "cert_common_names": [name]})
-        control["policies"].append({"subjects": [name], "rules": [rule["id"] for rule in rules]})
+        _allow(control, name, {"cert_common_names": [name]}, comes, goes)
     return control
+
+
+def _allow(control: dict[str, Any], name: str, who: Mapping[str, list[str]], comes: Grants, goes: Grants) -> None:
+    """Let those whom `who` describes send what `comes` allows, and have sent to them what `goes` does."""
+    rules = _rules(name, comes, goes)
+    control["rules"] += rules
+    control["subjects"].append({"id": name, **who})
+    control["policies"].append({"subjects": [name], "rules": [rule["id"] for rule in rules]})
 
 
 def _together(grants: Iterable[Grants]) -> Grants:
