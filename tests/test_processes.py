@@ -289,7 +289,7 @@ def test_under_nohup_a_lost_terminal_ends_nothing(live: Path, tmp_path: Path) ->
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
         assert process.stdout is not None
         try:
-            wait_for(lambda: len(node_processes(process.pid)) == 3, "all nodes")
+            wait_for(lambda: out.exists() and len(node_processes(process.pid)) == 3, "all nodes, and the recording")
             process.stdout.close()
             process.send_signal(signal.SIGHUP)
             node_processes(process.pid)["echo"].kill()  # that is two lines for nobody
