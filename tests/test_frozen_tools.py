@@ -18,8 +18,8 @@ from caneflow.runtime.hosts.run_directory import running_flows
 from tests.flows import Launched, free_port, launchers, wait_for
 
 Launch = Callable[..., Launched]
-FRAMES = 1_500  # of 32 kB: ten times what Zenoh and the kernel hold for a tool that takes nothing
-FROZEN = 3
+FRAMES = 1_000  # of 32 kB: several times what Zenoh and the kernel hold for a tool that takes nothing
+FROZEN = 2  # tools
 
 COUNTER = '''
 """Counts frames; slowly, until it is told to go."""
