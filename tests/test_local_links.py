@@ -229,12 +229,14 @@ def test_a_removed_folder_is_said_once_and_a_node_that_then_ends_ends_the_flow(
     tmp_path: Path, short: Path, launch: Callable[..., Launched], what: str
 ) -> None:
     flow = f"removed{time.time_ns()}"
-    launched = launch("run", write_flow(tmp_path, flow), log=tmp_path / "log")
+    file = write_flow(tmp_path, flow)
+    file.write_text(f"flow: {flow}\nnodes: {{ticker: {{run: ./ticker.py}}}}\nresults: [ticker/imu]\n")
+    launched = launch("run", file, log=tmp_path / "log")
     wait_for(lambda: [each for each in running_flows() if each.flow == flow], "the flow's address")
     target = Target(flow, launched, "")
     with target.client(target.inside) as session:
         heard = Heard(session, f"{flow}/**")
-        key = sample_key(flow, "echo", "imu")
+        key = sample_key(flow, "ticker", "imu")
         wait_for(lambda: len(heard.payloads.get(key, ())) > 10, "samples")
         processes = node_processes(launched.process.pid)
         for path in target.folder.iterdir():
@@ -245,11 +247,12 @@ def test_a_removed_folder_is_said_once_and_a_node_that_then_ends_ends_the_flow(
         before = len(heard.payloads[key])
         wait_for(lambda: len(heard.payloads[key]) > before + 50, "samples by the links that are there")
     assert caneflow("status", flow).returncode == 2
-    os.kill(processes["echo"].pid, signal.SIGKILL)
+    os.kill(processes["ticker"].pid, signal.SIGKILL)
     assert launched.ends(30) == 1
     assert launched.said.count("was removed: the flow goes on") == 1
     assert (
-        f"caneflow run: echo cannot be started: {target.folder}/echo.json: the folder of the run was" in launched.said
+        f"caneflow run: ticker cannot be started: {target.folder}/ticker.json: the folder of the run was"
+        in launched.said
     )
     assert "Traceback" not in launched.said
 
