@@ -22,7 +22,7 @@ $(WALK): | $(BIN)/.installed
 	$(BIN)/caneflow simulate walk --seed 1 --output $@
 
 run: $(BIN)/.installed $(WALK)
-	$(BIN)/caneflow run dataflow.yaml --replay $(WALK) --speed max --record build/track.mcap
+	$(BIN)/caneflow run dataflow.yaml --replay $(WALK) --speed max --record build/track.mcap --overwrite
 	$(BIN)/caneflow plot build/track.mcap --output build/track.png
 	@echo "the paper's mean final error over ten walks: 1.3 m; the picture: build/track.png"
 
@@ -59,9 +59,9 @@ mcu-test: $(BIN)/.installed
 bench: $(BIN)/.installed $(WALK)
 	$(BIN)/pip install --quiet --editable '.[peers]'
 	$(BIN)/pytest --benchmark-enable --benchmark-only
-	$(BIN)/python -m benchmarks.scaling --repeats $(REPEATS) --write docs/performance_scaling.md
-	$(BIN)/python -m benchmarks.pipeline $(WALK) --repeats $(REPEATS) --write docs/performance_pipeline.md
-	$(BIN)/python -m benchmarks.peers --repeats $(REPEATS) --write docs/performance_peers.md  # last: fails when slower
+	$(BIN)/python -m benchmarks.scaling --repeats $(REPEATS) --write docs/performance_scaling.md --overwrite
+	$(BIN)/python -m benchmarks.pipeline $(WALK) --repeats $(REPEATS) --write docs/performance_pipeline.md --overwrite
+	$(BIN)/python -m benchmarks.peers --repeats $(REPEATS) --write docs/performance_peers.md --overwrite  # last: fails when slower
 
 clean:
 	rm -rf $(VENV) build

@@ -16,8 +16,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
+from benchmarks import pages
 from benchmarks.contenders import CONTENDERS, DORA, HERE
 from benchmarks.measuring import Measured, measured, median, spread
 from benchmarks.work import Job
@@ -60,22 +60,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--part", choices=list(PARTS), help="one part only")
     parser.add_argument("--repeats", type=int, default=3, help="runs of each contender (default: 3)")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="write the tables there, and all figures beside it")
+    pages.add_options(parser)
     options = parser.parse_args()
     contenders = [name for name in CONTENDERS if name != "dora" or DORA.exists()]
     if "dora" not in contenders:
         print("dora is not installed (pip install 'caneflow[peers]') and left out", file=sys.stderr)
     os.environ["PYTHONPATH"] = str(HERE.parent)  # of the contenders' processes, which start elsewhere
     found = {}
-    for part in [options.part] if options.part else PARTS:
-        able = [name for name in contenders if part != "drain" or name != "dora"]
-        found[part] = rounds(PARTS[part], able, options.repeats)
-    page = "\n".join(written(found, options.repeats))
-    slower = list(regressions(found))
-    print(page)
-    if options.write:
-        options.write.write_text(page + "\n")
-        options.write.with_suffix(".json").write_text(json.dumps(plain(found), indent=1) + "\n")
+    with pages.written_at_the_end(options) as paths:
+        for part in [options.part] if options.part else PARTS:
+            able = [name for name in contenders if part != "drain" or name != "dora"]
+            found[part] = rounds(PARTS[part], able, options.repeats)
+        page = "\n".join(written(found, options.repeats))
+        slower = list(regressions(found))
+        print(page)
+        if paths is not None:
+            paths[0].write_text(page + "\n")
+            paths[1].write_text(json.dumps(plain(found), indent=1) + "\n")
     if slower:
         sys.exit("\n".join(slower))
 

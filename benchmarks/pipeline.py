@@ -18,7 +18,7 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks import canes
+from benchmarks import canes, pages
 from benchmarks.contenders import CANEFLOW, HERE
 from benchmarks.measuring import spread
 from benchmarks.peers import versions
@@ -60,21 +60,21 @@ def main() -> None:
     parser.add_argument("walk", type=Path)
     parser.add_argument("--repeats", type=int, default=3, help="runs of each (default: 3)")
     parser.add_argument("--canes", type=int, nargs="+", default=[1, 4, 6, 8], help="at once (default: 1 4 6 8)")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="write the tables there, and all figures beside it")
+    pages.add_options(parser)
     options = parser.parse_args()
     walk, repeats = options.walk.resolve(), range(options.repeats)
-    with tempfile.TemporaryDirectory() as folder:
+    with pages.written_at_the_end(options, inputs=[walk]) as paths, tempfile.TemporaryDirectory() as folder:
         found = Found(
             times_real_time={graph: [times_real_time(walk, more) for _ in repeats] for graph, more in GRAPHS.items()},
             start_up=[start_up(DATAFLOW, walk, Path(folder) / "out.mcap") for _ in range(STARTS)],
             canes={number: [side_by_side(walk, number) for _ in repeats] for number in options.canes},
             fleet=fleet(Path(folder), len(repeats)),
         )
-    page = "\n".join(written(found, options.repeats))
-    print(page)
-    if options.write:
-        options.write.write_text(page + "\n")
-        options.write.with_suffix(".json").write_text(json.dumps(asdict(found), indent=1) + "\n")
+        page = "\n".join(written(found, options.repeats))
+        print(page)
+        if paths is not None:
+            paths[0].write_text(page + "\n")
+            paths[1].write_text(json.dumps(asdict(found), indent=1) + "\n")
 
 
 def times_real_time(walk: Path, more: Sequence[str]) -> float:

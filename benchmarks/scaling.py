@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from benchmarks import pages
 from benchmarks.contenders import CANEFLOW, HERE
 from benchmarks.measuring import Measured, measured, median, spread
 from benchmarks.work import Job
@@ -70,21 +71,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--axis", choices=list(AXES), help="one only")
     parser.add_argument("--repeats", type=int, default=3, help="runs of each point (default: 3)")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="the tables; figures and curves go beside it")
+    pages.add_options(parser)
     options = parser.parse_args()
     os.environ["PYTHONPATH"] = str(HERE.parent)  # of the nodes, which start elsewhere
     axes = {name: AXES[name] for name in ([options.axis] if options.axis else AXES)}
     found: Found = {name: [[] for _ in points] for name, (_, points) in axes.items()}
-    for _ in range(options.repeats):
-        for name, (unit, points) in axes.items():
-            for point, runs in zip(points, found[name], strict=True):
-                runs.append(measured(point.commands, point.job))
-                print(f"{point.x:g} {unit}: {figures(runs[-1], point)}", file=sys.stderr)
-    print("\n".join(tables(found, options.repeats)))
-    if options.write:
-        options.write.write_text("\n".join(tables(found, options.repeats)) + "\n")
-        options.write.with_suffix(".json").write_text(json.dumps(plain(found), indent=1) + "\n")
-        draw(found, options.write.parent / "pictures" / f"{options.write.stem}.png")
+    picture = options.write and options.write.parent / "pictures" / f"{options.write.stem}.png"
+    with pages.written_at_the_end(options, picture=picture) as paths:
+        for _ in range(options.repeats):
+            for name, (unit, points) in axes.items():
+                for point, runs in zip(points, found[name], strict=True):
+                    runs.append(measured(point.commands, point.job))
+                    print(f"{point.x:g} {unit}: {figures(runs[-1], point)}", file=sys.stderr)
+        print("\n".join(tables(found, options.repeats)))
+        if paths is not None:
+            paths[0].write_text("\n".join(tables(found, options.repeats)) + "\n")
+            paths[1].write_text(json.dumps(plain(found), indent=1) + "\n")
+            draw(found, paths[2])
 
 
 def flow(chain: int, fan: int) -> str:

@@ -31,7 +31,8 @@ def main() -> None:
 
 def start_up(dataflow: Path, walk: Path, out: Path) -> float:
     """S from the command to the moment at which the recorder wrote the first sample."""
-    command = [*CANEFLOW, "run", str(dataflow), "--replay", str(walk), "--duration", "0.5", "--record", str(out)]
+    command = [*CANEFLOW, "run", str(dataflow), "--replay", str(walk), "--duration", "0.5"]
+    command += ["--record", str(out), "--overwrite"]
     begun = time.time_ns()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     with out.open("rb") as file:

@@ -15,8 +15,8 @@ from typing import Any
 
 from typer.core import TyperArgument, TyperOption
 
-from caneflow.command import commands
 from caneflow.runtime import Operator, Sink, Source
+from caneflow.words import commands
 
 ROOMS = ("operators", "drivers")
 

@@ -96,12 +96,13 @@ def test_a_walk_that_failed_is_named_and_the_others_count() -> None:
 def test_pictures_are_small_and_the_same_every_time(tmp_path: Path) -> None:
     pyplot = experiments._pyplot()
     results = {"swing": ten("swing"), "stops": ten("stops")}
-    links = experiments.draw(pyplot, results, METHODS, tmp_path)
+    paths = {name: tmp_path / f"results_{name}.png" for name in ("tracks", "errors")}
+    links = experiments.draw(pyplot, results, METHODS, paths)
     first = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     linked = [re.findall(r"\(pictures/(.*)\)", link) for link in links.values()]
     assert sorted(first) == sorted(name for names in linked for name in names)
     assert all(len(data) < 200_000 for data in first.values())
-    experiments.draw(pyplot, results, METHODS, tmp_path)
+    experiments.draw(pyplot, results, METHODS, paths)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == first
 
 
@@ -142,6 +143,7 @@ def test_the_command_writes_the_same_page_again(tmp_path: Path) -> None:
 
     def written(name: str) -> tuple[str, bytes]:
         output = tmp_path / name / "results.md"
+        output.parent.mkdir()
         experiments.command(output=output, seeds=1, only="swing", flow=FLOW, folder=tmp_path / "walks")
         return output.read_text(), (output.parent / "pictures" / "results_errors.png").read_bytes()
 

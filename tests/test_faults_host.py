@@ -173,7 +173,7 @@ if __name__ == "__main__":
 '''
 
 # What is on the disk goes with the namespace it was mounted in, so it is copied out.
-ON_A_SMALL_DISK = 'mount -t tmpfs -o size=1m none "$0" && { "$@"; status=$?; cp "$0"/* "$0"/..; exit $status; }'
+ON_A_SMALL_DISK = 'mount -t tmpfs -o size=1m none "$0" && { "$@"; status=$?; cp -r "$0"/. "$0"/..; exit $status; }'
 
 
 @pytest.fixture

@@ -11,17 +11,17 @@ from typing import Any
 
 import pytest
 
-from caneflow import command
+from caneflow import command, words
 
 # As options are spelled out: `s of samples`, `in Hz`, `(MB)`, `times real time`.
 UNIT = re.compile(r"\b(s|ms|us|ns|Hz|m|m/s|m/s\^2|rad|rad/s|deg|dB|%|uT|MB|times|unit|quantile|part)\b|%|\bSI\b")
 
 
 def _commands() -> Iterator[tuple[str, Any]]:
-    for word, (module, _) in command.WORDS.items():
-        if find_spec(f"{command.TOOLS}.{module}") is None:
+    for word, (module, _) in words.WORDS.items():
+        if find_spec(f"{words.TOOLS}.{module}") is None:
             continue
-        tool = command._tool(module)
+        tool = words._tool(module)
         below = getattr(tool, "commands", None)
         if below:
             yield from ((f"{word} {name}", each) for name, each in below.items())
@@ -75,4 +75,4 @@ def test_completion_is_installed_and_completes_in_bash(tmp_path: Path) -> None:
         "source ~/.bashrc; COMP_WORDS=(caneflow rec); COMP_CWORD=1; _caneflow_completion caneflow; echo ${COMPREPLY[@]}"
     )
     done = subprocess.run(["bash", "-c", ask], env=env, capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) == {word for word in command.WORDS if word.startswith("rec")}
+    assert set(done.stdout.split()) == {word for word in words.WORDS if word.startswith("rec")}

@@ -242,7 +242,7 @@ def test_a_wrong_option_is_one_line(run_import: Import, tmp_path: Path, option: 
 
 def test_the_table_is_not_overwritten_by_its_recording(run_import: Import, tmp_path: Path) -> None:
     source = written(tmp_path / "a.csv", "1,0,0,0,0,0,1")
-    with pytest.raises(CaneflowError, match="is the table itself"):
+    with pytest.raises(CaneflowError, match="is an input of this command"):
         run_import(source, "-o", source, "--columns", COLUMNS_TOLD)
     assert source.read_text(encoding="utf-8-sig").startswith(HEADER)
 

@@ -46,7 +46,7 @@ ANSWER_TIME = 100.0  # s; a loaded machine emulates slowly
 
 def header_of(flow: Path, *settings: str, node: str | None = None) -> str:
     output = flow.parent / "observer_config.h"
-    mcu.config(flow, output=output, node=node, settings=list(settings))
+    mcu.config(flow, output=output, node=node, settings=list(settings), overwrite=True)
     return output.read_text()
 
 

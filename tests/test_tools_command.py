@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 import typer
 
-from caneflow import __version__, command
+from caneflow import __version__, command, words
 from caneflow.errors import CaneflowError
 
 Run = tuple[int, str, str]  # exit status, standard output, standard error
@@ -37,7 +37,7 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = ModuleType("caneflow.tools.fake")
     module.__spec__ = ModuleSpec(module.__name__, None)
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setitem(command.WORDS, "fake", ("fake", "Pretend."))
+    monkeypatch.setitem(words.WORDS, "fake", ("fake", "Pretend."))
     return module
 
 
@@ -51,7 +51,7 @@ def raising(error: BaseException) -> Callable[[], None]:
 def test_help_has_a_line_for_every_word_that_has_a_tool(caneflow: Callable[..., Run]) -> None:
     status, out, _ = caneflow("--help")
     assert status == 0
-    for word, (module, summary) in command.WORDS.items():
+    for word, (module, summary) in words.WORDS.items():
         listed = any(f" {word} " in line and summary[:20] in line for line in out.splitlines())
         assert listed == (Path(__file__).parents[1] / "tools" / f"{module}.py").exists(), word
 
@@ -113,7 +113,7 @@ def test_a_bug_keeps_its_traceback(tool: ModuleType, monkeypatch: pytest.MonkeyP
 
 
 def test_the_door_imports_no_tool_and_nothing_heavy() -> None:
-    look = "import sys, caneflow.command as c; c._command(); print(*sys.modules)"
+    look = "import sys, caneflow.words as c; c._command(); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
     heavy = {"numpy", "scipy", "matplotlib", "zenoh", "mcap", "msgspec", "pydantic", "ruamel"}
     loaded = done.stdout.split()

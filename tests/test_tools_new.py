@@ -53,7 +53,7 @@ def test_programs_pass_their_own_tests_and_make_a_flow(caneflow: Callable[..., R
 def test_what_is_there_is_not_written_over(caneflow: Callable[..., Run], tmp_path: Path) -> None:
     mine = tmp_path / "test_smooth.py"
     mine.write_text("mine")
-    said = f"caneflow new: {mine}: is there already; give another name, or remove it\n"
+    said = f"caneflow new: {mine}: already exists; use --overwrite to replace it\n"
     assert caneflow("new", "operator", "smooth", "--folder", tmp_path) == (2, "", said)
     assert [path.name for path in tmp_path.iterdir()] == ["test_smooth.py"]
 

@@ -27,6 +27,8 @@ from caneflow.algorithms.rotations import rotate
 from caneflow.algorithms.standing import StandingDetector, StandingSettings
 from caneflow.errors import CaneflowError
 from caneflow.messages.rig import Rig, read_rig
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.runtime.replays.workers import mapped
 from caneflow.simulation.doppler_module import Kind
 from caneflow.simulation.room_scenario import PARTS, Part, RoomRecording, World, room_settings, simulate_kinds
@@ -116,6 +118,7 @@ def command(
     first: Annotated[int, typer.Option(metavar="SEED", min=0, help="The first installation.")] = FIRST_SEED,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="How many cases at a time.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the errors of every case; write no page.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate installations, calibrate them as `calibrate room` does, and leave out one measurement after another.
 
@@ -123,24 +126,25 @@ def command(
     revolutions of a circle with U-turns, and the varied courses. The same sources write the same page again. A case
     takes about half a minute.
 
-    Example: caneflow ablation --seeds 10 --jobs 2
+    Example: caneflow ablation --seeds 10 --jobs 2 --overwrite
     """
     cases = chosen_cases(first, seeds, others)
-    console = Console(stderr=True)
-    found = track(
-        mapped(evaluated, cases, jobs),
-        "installations",
-        len(cases),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    results = dict(zip(cases, found, strict=True))
-    if as_json:
-        print(json.dumps(described(results), indent=2))
-        return
-    made_by = f"caneflow ablation --seeds {seeds} --others {others} --first {first}"
-    output.write_text("\n".join(page(results, made_by)) + "\n", encoding="utf-8")
+    with whole(None if as_json else output, overwrite=overwrite) as path:
+        console = Console(stderr=True)
+        found = track(
+            mapped(evaluated, cases, jobs),
+            "installations",
+            len(cases),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        results = dict(zip(cases, found, strict=True))
+        if path is None:
+            print(json.dumps(described(results), indent=2))
+            return
+        made_by = f"caneflow ablation --seeds {seeds} --others {others} --first {first}"
+        path.write_text("\n".join(page(results, made_by)) + "\n", encoding="utf-8")
     print(f"{output}: {len(cases)} cases")
 
 

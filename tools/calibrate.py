@@ -24,7 +24,9 @@ from caneflow.algorithms.room_tracking import StaticSensor
 from caneflow.errors import CaneflowError
 from caneflow.messages import DopplerBlock, Pose
 from caneflow.messages.rig import Rig, read_rig
-from caneflow.recording import TRUTH, Recording, require_writable
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
+from caneflow.recording import TRUTH, Recording
 
 BLOCK = "block"  # the port of a Doppler module
 
@@ -49,6 +51,7 @@ def room(
             help="m, where a walk starts, for walks without truth: once for all, or once for each in their order.",
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Find how strong an echo is at which range: k of every Doppler module of a room.
 
@@ -57,12 +60,12 @@ def room(
 
     Example: caneflow calibrate room empty.mcap south.mcap west.mcap --start 4,0.5 --start 0.5,4 -o rig.yaml
     """
-    require_writable(output)
-    rig = room_rig(empty)
-    floors = {name: noise_floor(empty, name) for name in rig.sensors}
-    starts = starts_of(start or [], len(walks))
-    found = {name: calibrated(name, rig, floors[name], walks, starts) for name in rig.sensors}
-    output.write_text(rig_yaml(rig, {name: each.k for name, each in found.items()}), encoding="utf-8")
+    with whole(output, inputs=[empty, *walks], overwrite=overwrite) as path:
+        rig = room_rig(empty)
+        floors = {name: noise_floor(empty, name) for name in rig.sensors}
+        starts = starts_of(start or [], len(walks))
+        found = {name: calibrated(name, rig, floors[name], walks, starts) for name in rig.sensors}
+        path.write_text(rig_yaml(rig, {name: each.k for name, each in found.items()}), encoding="utf-8")
     print(f"{'sensor':10}{'k':>10}{'spread':>10}{'exponent':>10}{'hops':>7}{'floor':>10}")
     for name, each in found.items():
         floor = 10.0 * math.log10(float(np.median(floors[name])))

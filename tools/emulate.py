@@ -37,6 +37,7 @@ from caneflow.recording import Recording
 MCAP = b"\x89MCAP"  # how a recording begins; a log begins with a configuration block
 LONGEST_WAIT = 0.5  # s
 SERIAL_PORT = Path(gettempdir()) / "caneflow-bno055"
+TERMINALS = Path("/dev/pts")
 GRAVITY = 9.81  # m/s^2
 
 
@@ -160,8 +161,9 @@ class _Plug:
 
     def put_in(self) -> None:
         """Make the port; raises CaneflowError when something else has its name."""
-        if self._path.exists() and not self._path.is_symlink():
-            raise CaneflowError(f"{self._path}: is there and is no link; choose another name with --port")
+        # What an emulator that was killed left behind is a link to a pseudo-terminal.
+        if os.path.lexists(self._path) and not (self._path.is_symlink() and self._path.readlink().parent == TERMINALS):
+            raise CaneflowError(f"{self._path}: exists and is no emulator's port; choose another name with --port")
         # This end of the terminal stays open too, or a driver that leaves would take the terminal with it.
         self._ends = os.openpty()
         tty.setraw(self._ends[1])

@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.progress import track
 
 from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
+from caneflow.options import Overwrite
+from caneflow.outputs import require_no_input, whole
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.replays.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated
 from caneflow.runtime.replays.results_file import ResultsFile
@@ -75,6 +77,7 @@ def command(
         Path | None,
         typer.Option("--csv", metavar="FILE", help="Write a row per method and recording as well."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run the methods of `fusion` over recordings, all in one process each, and hold them against the truth.
 
@@ -83,21 +86,24 @@ def command(
 
     Example: caneflow eval walks/*.mcap --methods luenberger,best --jobs 2
     """
-    wanted = [word.strip() for word in methods.split(",")] if methods is not None else []
-    graph = load(flow, settings or ())
-    chosen = chosen_methods(graph, wanted)
     recordings = list(dict.fromkeys(recordings))
-    run = partial(evaluated, flow, methods=chosen, overrides=settings or (), jobs=jobs, scheduler=scheduler)
-    with ResultsFile(results_file, graph, chosen) if results_file is not None else nullcontext() as kept:
-        results = run(recordings) if kept is None else _resumed(kept, recordings, run)
-        done = list(_shown(results, len(recordings)))
-    by_method = gathered(chosen, done)
+    if results_file is not None:
+        require_no_input(results_file, [flow, *recordings])
+    with whole(csv_file, inputs=[flow, results_file, *recordings], overwrite=overwrite) as table:
+        wanted = [word.strip() for word in methods.split(",")] if methods is not None else []
+        graph = load(flow, settings or ())
+        chosen = chosen_methods(graph, wanted)
+        run = partial(evaluated, flow, methods=chosen, overrides=settings or (), jobs=jobs, scheduler=scheduler)
+        with ResultsFile(results_file, graph, chosen) if results_file is not None else nullcontext() as kept:
+            results = run(recordings) if kept is None else _resumed(kept, recordings, run)
+            done = list(_shown(results, len(recordings)))
+        by_method = gathered(chosen, done)
+        if table is not None:
+            write_csv(by_method, table)
     if as_json:
         print(json.dumps(by_method, indent=2, allow_nan=False))
     else:
         print("\n".join(lines(by_method)))
-    if csv_file is not None:
-        write_csv(by_method, csv_file)
     failures = [line for result in done for line in failed(result)]
     for line in failures:
         print(f"caneflow eval: {line}", file=sys.stderr)

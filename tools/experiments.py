@@ -10,7 +10,9 @@ import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -24,6 +26,8 @@ import caneflow
 from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
 from caneflow.algorithms.track_errors import aligned
 from caneflow.errors import CaneflowError
+from caneflow.options import Overwrite
+from caneflow.outputs import made_folder, whole
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.replays.evaluation import Evaluation, chosen_methods, evaluated
 from caneflow.simulation import scenario as walk_scenarios
@@ -104,30 +108,37 @@ def command(
     folder: Annotated[
         Path, typer.Option(metavar="DIR", help="Where the walks are kept until the simulator changes.")
     ] = Path("build/experiments"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate the walks that are not there yet (10 s each), run every method over them, write the page.
 
     The same sources write the same page again. Exit status 1: some walk or method failed; the page says which.
 
-    Example: caneflow experiments --seeds 10 --jobs 2
+    Example: caneflow experiments --seeds 10 --jobs 2 --overwrite
     """
-    pyplot = _pyplot()
-    methods = chosen_methods(load(flow))
     scenarios = _scenarios(only)
-    walks = {
-        scenario: [folder / fingerprint() / f"{scenario}_{seed}.mcap" for seed in range(1, seeds + 1)]
-        for scenario in scenarios
-    }
-    every = [path for paths in walks.values() for path in paths]
-    simulate([path for path in every if not path.exists()], jobs)
-    by_path = _evaluations(flow, every, methods, jobs)
-    results = {scenario: [by_path[path] for path in paths] for scenario, paths in walks.items()}
-    pictures = output.parent / "pictures"
-    pictures.mkdir(parents=True, exist_ok=True)
-    drawn = draw(pyplot, results, methods, pictures)
-    made_by = f"caneflow experiments --seeds {seeds}" + (f" --only {only}" if only else "")
-    lines = [*_head(made_by, seeds), *page(results, methods, drawn)]
-    output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    pictures = {name: output.parent / "pictures" / f"results_{name}.png" for name in ("tracks", "errors")}
+    with ExitStack() as outputs:
+        page_path = outputs.enter_context(whole(output, inputs=[flow], overwrite=overwrite))
+        outputs.enter_context(made_folder(output.parent / "pictures"))
+        drawn_at = {
+            name: outputs.enter_context(whole(path, inputs=[flow], overwrite=overwrite))
+            for name, path in pictures.items()
+        }
+        pyplot = _pyplot()
+        methods = chosen_methods(load(flow))
+        walks = {
+            scenario: [folder / fingerprint() / f"{scenario}_{seed}.mcap" for seed in range(1, seeds + 1)]
+            for scenario in scenarios
+        }
+        every = [path for paths in walks.values() for path in paths]
+        simulate([path for path in every if not path.exists()], jobs)
+        by_path = _evaluations(flow, every, methods, jobs)
+        results = {scenario: [by_path[path] for path in paths] for scenario, paths in walks.items()}
+        drawn = draw(pyplot, results, methods, drawn_at)
+        made_by = f"caneflow experiments --seeds {seeds}" + (f" --only {only}" if only else "")
+        lines = [*_head(made_by, seeds), *page(results, methods, drawn)]
+        page_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     if any(result.failures for result in by_path.values()):
         print(f"caneflow experiments: some walks failed; {output} says which", file=sys.stderr)
         raise typer.Exit(FAILED_STATUS)
@@ -142,15 +153,18 @@ def fingerprint(walks: Path = WALKS) -> str:
 
 
 def simulate(missing: Sequence[Path], jobs: int) -> None:
-    """Make walks named `SCENARIO_SEED.mcap`, each by a `caneflow simulate` of its own."""
+    """Make walks named `SCENARIO_SEED.mcap`, each by a `caneflow simulate` of its own, which ends with this."""
     for path in missing:
         path.parent.mkdir(parents=True, exist_ok=True)
+    running: list[subprocess.Popen[str]] = []
     with ThreadPoolExecutor(jobs) as pool:
         try:
-            for _ in _shown(pool.map(_simulate, missing), "simulating", len(missing)):
+            for _ in _shown(pool.map(partial(_simulate, running), missing), "simulating", len(missing)):
                 pass
         except BaseException:
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
+            for program in running:
+                program.terminate()
             raise
 
 
@@ -168,16 +182,16 @@ def page(
 
 
 def draw(
-    pyplot: Any, results: Mapping[str, Sequence[Evaluation]], methods: Sequence[str], folder: Path
+    pyplot: Any, results: Mapping[str, Sequence[Evaluation]], methods: Sequence[str], paths: Mapping[str, Path]
 ) -> dict[str, str]:
-    """Draw the pictures into `folder`; links to them, as seen from the page."""
+    """Draw the pictures to their `paths`, `tracks` where there are any; links to them, as seen from the page."""
     drawn = {}
     pictured = [method for method in PICTURED if method in methods]
     if ONE_WALK in results and pictured:
-        _draw_tracks(pyplot, results[ONE_WALK], pictured, folder / "results_tracks.png")
+        _draw_tracks(pyplot, results[ONE_WALK], pictured, paths["tracks"])
         names = " and ".join(_name(method) for method in pictured)
         drawn["tracks"] = f"![Tracks of the swing walks by {names}, the truth in grey](pictures/results_tracks.png)"
-    _draw_errors(pyplot, results, methods, folder / "results_errors.png")
+    _draw_errors(pyplot, results, methods, paths["errors"])
     drawn["errors"] = "![Final error of every walk, by experiment and method](pictures/results_errors.png)"
     return drawn
 
@@ -212,16 +226,16 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
     return tree
 
 
-def _simulate(path: Path) -> None:
+def _simulate(running: list[subprocess.Popen[str]], path: Path) -> None:
     scenario, _, seed = path.stem.rpartition("_")
-    unfinished = path.with_suffix(".part")
-    words = ["simulate", "walk", "--scenario", scenario, "--seed", seed, "--output", str(unfinished)]
-    program = [sys.executable, "-m", "caneflow.command"]
-    done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
-    if done.returncode:
-        said = " ".join(done.stderr.split()) or f"status {done.returncode}"
-        raise CaneflowError(f"caneflow {' '.join(words)}: {said}")
-    unfinished.rename(path)
+    words = ["simulate", "walk", "--scenario", scenario, "--seed", seed, "--output", str(path)]
+    command = [sys.executable, "-m", "caneflow.command", *words]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    running.append(program)
+    _, said = program.communicate()
+    if program.returncode and not path.exists():  # it does where another command has simulated the same walk
+        reason = " ".join(said.split()) or f"status {program.returncode}"
+        raise CaneflowError(f"caneflow {' '.join(words)}: {reason}")
 
 
 def _evaluations(flow: Path, paths: Sequence[Path], methods: Sequence[str], jobs: int) -> dict[Path, Evaluation]:

@@ -2,8 +2,7 @@
 
 import csv
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, TextIO
@@ -13,6 +12,8 @@ import typer
 from msgspec import inspect
 
 from caneflow.messages import Pose, Sample
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.recording import TRUTH, Recorded, Recording, RecordingError, Stream
 
 
@@ -51,42 +52,46 @@ def command(
         str | None,
         typer.Option(metavar="NODE/PORT", help="tum, csv: stream to write; by default the only one that fits."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write one stream of a recording as text (tum, csv), or all of it for other viewers (foxglove, rosbag2).
 
     Example: caneflow export track.mcap --format tum -o track.tum
     """
     if form not in TEXT:
-        _export_whole(recording, form, output, stream)
+        _export_whole(recording, form, output, stream, overwrite=overwrite)
         return
-    with Recording(recording) as source:
+    with whole(output, inputs=[recording], overwrite=overwrite) as path, Recording(recording) as source:
         chosen = _chosen(source, form, stream)
         samples = source.samples([(chosen.node, chosen.port)])
-        with _writing_to(output) as text:
-            if form is Format.TUM:
-                write_tum(samples, text)
-            else:
-                write_csv(samples, text)
+        write = write_tum if form is Format.TUM else write_csv
+        if path is None:
+            write(samples, sys.stdout)
+        else:
+            with path.open("w", encoding="utf-8", newline="") as text:
+                write(samples, text)
 
 
-def _export_whole(recording: Path, form: Format, output: Path | None, stream: str | None) -> None:
+def _export_whole(recording: Path, form: Format, output: Path | None, stream: str | None, *, overwrite: bool) -> None:
     if output is None:
         raise RecordingError(
             f"--format {form}: needs -o, the {'folder' if form is Format.ROSBAG2 else 'file'} to write"
         )
     if stream is not None:
         raise RecordingError(f"--format {form}: takes the whole recording; --stream is for tum and csv")
-    if output.exists() and output.samefile(recording):
-        raise RecordingError(f"{output}: is the recording itself; give another name")
-    with Recording(recording) as source:
+    is_folder = form is Format.ROSBAG2
+    with (
+        whole(output, inputs=[recording], overwrite=overwrite, folder=is_folder) as path,
+        Recording(recording) as source,
+    ):
         if form is Format.FOXGLOVE:
             from caneflow.recording.export_foxglove import export_foxglove  # here, as each brings its own library
 
-            written = export_foxglove(source, output)
+            written = export_foxglove(source, path)
         else:
             from caneflow.recording.export_rosbag2 import export_rosbag2
 
-            written = export_rosbag2(source, output)
+            written = export_rosbag2(source, path)
         left_out = [f"{node}/{port}" for node, port in source.streams if f"/{node}/{port}" not in written]
     for topic, count in written.items():
         print(f"{count:8d}  {topic}")
@@ -173,15 +178,3 @@ def _values(value: Any, length: int) -> Sequence[Any]:
     if length == 0:
         return [value]
     return [None] * length if value is None else value
-
-
-@contextmanager
-def _writing_to(path: Path | None) -> Iterator[TextIO]:
-    if path is None:
-        yield sys.stdout
-    else:
-        try:
-            with path.open("w", encoding="utf-8", newline="") as text:
-                yield text
-        except OSError as error:  # a full disk names no file
-            raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error

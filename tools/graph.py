@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.graph_pictures import as_data, as_mermaid, as_svg
 from caneflow.runtime.dataflow.loading import load
@@ -30,13 +32,17 @@ def command(
         Path | None,
         typer.Option("--output", "-o", metavar="FILE", help="Write it there; by default it is printed."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw a flow: its programs, the messages between them, the machines they are on.
 
+    A picture of a flow in the same format is replaced; any other file only with --overwrite.
+
     Example: caneflow graph dataflow.yaml --format svg -o flow.svg
     """
-    picture = DRAW[kind](load(file))
-    if output is None:
-        print(picture, end="")
-    else:
-        output.write_text(picture, encoding="utf-8")
+    with whole(output, inputs=[file], overwrite=overwrite, picture=kind) as path:
+        picture = DRAW[kind](load(file))
+        if path is None:
+            print(picture, end="")
+        else:
+            path.write_text(picture, encoding="utf-8")

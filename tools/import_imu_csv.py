@@ -9,6 +9,8 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import NAME, NAME_RULE, Imu, numbered, sample_key
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.imu_csv import COLUMNS, UNITS, ImuTable, Reading, assignments
 from caneflow.recording import RecordingWriter
@@ -39,6 +41,7 @@ def imu_csv(
         str, typer.Option(metavar="FLOW/NODE/PORT", help="Under which name it is recorded.")
     ] = "cane/imu/imu",
     delimiter: Annotated[str, typer.Option(metavar="CHAR", help="What stands between cells; or tab.")] = ",",
+    overwrite: Overwrite = False,
 ) -> None:
     r"""Make a recording of a table of IMU readings, for example a logger's CSV file.
 
@@ -57,19 +60,20 @@ def imu_csv(
     delimiter = "\t" if delimiter == "tab" else delimiter
     if len(delimiter) != 1 or delimiter in '"\r\n':
         raise CaneflowError(f"--delimiter {delimiter!r}: expected one character, or tab")
-    if output.exists() and output.samefile(table):
-        raise CaneflowError(f"{output}: is the table itself; the recording needs another name")
     try:
         wanted = assignments(columns, COLUMNS)
         told = assignments(units, UNITS) if units else {}
     except ProtocolError as error:
         raise CaneflowError(f"--columns or --units: {error}") from error
-    with table.open(encoding="utf-8-sig", errors="replace", newline="") as lines:
+    with (
+        whole(output, inputs=[table], overwrite=overwrite) as recording,
+        table.open(encoding="utf-8-sig", errors="replace", newline="") as lines,
+    ):
         try:
             rows = ImuTable(lines, columns=wanted, units=told, delimiter=delimiter)
         except ProtocolError as error:
             raise CaneflowError(f"{table}: {error}") from error
-        count, last = _write(output, flow, stream, table, rows)
+        count, last = _write(recording, flow, stream, table, rows)
     rate = f"{(count - 1) * 1e9 / last:.2f} Hz, {last / 1e9:.1f} s" if last else "no rate"
     print(f"{output}: {count} samples, {rate}; {rows.refusals}")
 

@@ -10,6 +10,8 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import NAME, NAME_RULE, RadarFrame, numbered, sample_key
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.mrm_scans import Log, Scan, milliseconds_after, parse_log
 from caneflow.recording import RecordingWriter
@@ -33,6 +35,7 @@ def p440(
     source_id: Annotated[
         int | None, typer.Option("--source", metavar="ID", help="Which radar, where several are in the log.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a recording of a P440's log: its configuration, then MRM_SCAN_INFO packets as they came by UDP.
 
@@ -41,22 +44,23 @@ def p440(
     Example: caneflow import p440 scan_2105627.txt -o rail.mcap
     """
     key = _key(flow, stream)
-    parsed = _parsed(log)
-    scans = _scans_of_one_radar(log, parsed, source_id)
-    stamps = stamps_of([scan.timestamp_ms for scan in scans])
-    period = scan_period(stamps)
-    with RecordingWriter(output, flow=flow, source="imported", rig={}) as writer:
-        for seq, (stamp, scan) in enumerate(zip(stamps, scans, strict=True)):
-            frame = RadarFrame(
-                stamp=stamp,
-                scans=scan.samples[None, :],
-                scan_period=period,
-                range_start=scan.range_start(1000.0 * antenna_delay),
-                range_step=scan.range_step,
-                carrier=carrier,
-                bandwidth=bandwidth,
-            )
-            writer.write(key, RadarFrame, numbered(frame, seq), stamp=stamp, seq=seq, log_time=stamp)
+    with whole(output, inputs=[log], overwrite=overwrite) as recording:
+        parsed = _parsed(log)
+        scans = _scans_of_one_radar(log, parsed, source_id)
+        stamps = stamps_of([scan.timestamp_ms for scan in scans])
+        period = scan_period(stamps)
+        with RecordingWriter(recording, flow=flow, source="imported", rig={}) as writer:
+            for seq, (stamp, scan) in enumerate(zip(stamps, scans, strict=True)):
+                frame = RadarFrame(
+                    stamp=stamp,
+                    scans=scan.samples[None, :],
+                    scan_period=period,
+                    range_start=scan.range_start(1000.0 * antenna_delay),
+                    range_step=scan.range_step,
+                    carrier=carrier,
+                    bandwidth=bandwidth,
+                )
+                writer.write(key, RadarFrame, numbered(frame, seq), stamp=stamp, seq=seq, log_time=stamp)
     print(f"{output}: {len(scans)} scans of {len(scans[0].samples)} samples, {1 / period:.2f} Hz, {_losses(parsed)}")
 
 

@@ -7,6 +7,8 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import NAME, NAME_RULE, DopplerBlock, numbered, sample_key
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.protocols.doppler_blocks import ModuleChannels
 from caneflow.recording import RecordingWriter
 from caneflow.recording.sound_file import SoundFile
@@ -24,6 +26,7 @@ def wav(
     key: Annotated[
         str, typer.Option(metavar="FLOW/NODE/PORT", help="Under which name it is recorded.")
     ] = "room/south/block",
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a recording of a sound file: the blocks that drivers.doppler_adc gives with the setting `file`.
 
@@ -35,18 +38,17 @@ def wav(
     flow, stream = _flow_and_key(key)
     if quadrature == channel:
         raise CaneflowError(f"--quadrature {quadrature}: is --channel too; I and Q are on two channels")
-    if output.exists() and sound.exists() and output.samefile(sound):
-        raise CaneflowError(f"{output}: is the sound itself; the recording needs another name")
-    file = SoundFile(sound, ModuleChannels(first=channel, quadrature=quadrature), block=block)
-    if not file.frames:
-        raise CaneflowError(f"{sound}: holds no sound")
-    seq, end = 0, 0
-    with RecordingWriter(output, flow=flow, source="imported", rig={}) as writer:
-        for samples, last in file.blocks():
-            stamp = round(last * 1e9 / file.sample_rate)
-            sample = DopplerBlock(stamp=stamp, samples=samples, sample_rate=file.sample_rate, carrier=carrier)
-            writer.write(stream, DopplerBlock, numbered(sample, seq), stamp=stamp, seq=seq, log_time=stamp)
-            seq, end = seq + 1, last + 1
+    with whole(output, inputs=[sound], overwrite=overwrite) as recording:
+        file = SoundFile(sound, ModuleChannels(first=channel, quadrature=quadrature), block=block)
+        if not file.frames:
+            raise CaneflowError(f"{sound}: holds no sound")
+        seq, end = 0, 0
+        with RecordingWriter(recording, flow=flow, source="imported", rig={}) as writer:
+            for samples, last in file.blocks():
+                stamp = round(last * 1e9 / file.sample_rate)
+                sample = DopplerBlock(stamp=stamp, samples=samples, sample_rate=file.sample_rate, carrier=carrier)
+                writer.write(stream, DopplerBlock, numbered(sample, seq), stamp=stamp, seq=seq, log_time=stamp)
+                seq, end = seq + 1, last + 1
     lacking = f"; {file.frames - end} of {file.frames} frames are not in the file" if end < file.frames else ""
     refused = f"; {file.refused} blocks left out: they hold what is no number" if file.refused else ""
     length = f"{end / file.sample_rate:.1f} s at {file.sample_rate:g} Hz"

@@ -9,6 +9,8 @@ from caneflow.algorithms.luenberger import LuenbergerSettings
 from caneflow.algorithms.luenberger_fixed import GAIN, METHOD, UNIT, ObserverConstants, observer_constants
 from caneflow.errors import CaneflowError
 from caneflow.messages.rig import read_rig
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.dataflow.loading import load
 
@@ -26,6 +28,7 @@ def config(
         list[str] | None,
         typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting (may be given again)."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write the observer's gain and boresight in fixed point, as mcu/ compiles them in.
 
@@ -33,18 +36,19 @@ def config(
 
     Example: caneflow mcu config dataflow.yaml -o observer_config.h
     """
-    graph = load(file, settings or ())
-    fusion = fusion_of(graph, node)
-    boresight = read_rig(graph.rig).boresight
-    try:
-        constants = observer_constants(fusion.settings.luenberger, boresight)
-    except ValueError as error:
-        raise CaneflowError(f"{file}: nodes.{fusion.name}.settings.luenberger: {error}") from error
-    text = header(constants, f"{file.name}, node {fusion.name}")
-    if output is None:
-        print(text, end="")
-    else:
-        output.write_text(text)
+    with whole(output, inputs=[file], overwrite=overwrite) as path:
+        graph = load(file, settings or ())
+        fusion = fusion_of(graph, node)
+        boresight = read_rig(graph.rig).boresight
+        try:
+            constants = observer_constants(fusion.settings.luenberger, boresight)
+        except ValueError as error:
+            raise CaneflowError(f"{file}: nodes.{fusion.name}.settings.luenberger: {error}") from error
+        text = header(constants, f"{file.name}, node {fusion.name}")
+        if path is None:
+            print(text, end="")
+        else:
+            path.write_text(text)
 
 
 commands = {"config": config}

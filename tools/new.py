@@ -7,6 +7,8 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import NAME, NAME_RULE
+from caneflow.options import Overwrite
+from caneflow.outputs import require_free, whole
 
 OPERATOR = '''"""Smoothed rotation: an IMU's samples with a low-pass filter over the gyro.
 
@@ -182,6 +184,7 @@ def test_ticks_keep_their_rate_whatever_a_reading_takes() -> None:
 def operator(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Of the file and of the node, e.g. smooth.")],
     folder: Annotated[Path, typer.Option("--folder", metavar="DIR", help="Where to put the files.")] = Path(),
+    overwrite: Overwrite = False,
 ) -> None:
     """Write NAME.py, an operator that works, and test_NAME.py; print its line for dataflow.yaml.
 
@@ -190,12 +193,13 @@ def operator(
     Example: caneflow new operator smooth
     """
     line = f"  {name}: {{run: ./{name}.py, inputs: {{imu: imu/imu}}, settings: {{time_constant: 0.1}}}}"
-    _write(name, folder, OPERATOR, OPERATOR_TEST, line)
+    _write(name, folder, OPERATOR, OPERATOR_TEST, line, overwrite=overwrite)
 
 
 def driver(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Of the file and of the node, e.g. my_gyro.")],
     folder: Annotated[Path, typer.Option("--folder", metavar="DIR", help="Where to put the files.")] = Path(),
+    overwrite: Overwrite = False,
 ) -> None:
     """Write NAME.py, a driver that works, and test_NAME.py; print its line for dataflow.yaml.
 
@@ -204,22 +208,23 @@ def driver(
 
     Example: caneflow new driver my_gyro
     """
-    _write(name, folder, DRIVER, DRIVER_TEST, f"  {name}: {{run: ./{name}.py, settings: {{rate: 100}}}}")
+    line = f"  {name}: {{run: ./{name}.py, settings: {{rate: 100}}}}"
+    _write(name, folder, DRIVER, DRIVER_TEST, line, overwrite=overwrite)
 
 
 commands = {"operator": operator, "driver": driver}
 
 
-def _write(name: str, folder: Path, program: str, test: str, line: str) -> None:
+def _write(name: str, folder: Path, program: str, test: str, line: str, *, overwrite: bool) -> None:
     if not NAME.fullmatch(name):
         raise CaneflowError(f"{name!r} is no name for a node: {NAME_RULE}")
     files = {folder / f"{name}.py": program, folder / f"test_{name}.py": test}
     for path in files:
-        if path.exists():
-            raise CaneflowError(f"{path}: is there already; give another name, or remove it")
+        require_free(path, overwrite=overwrite)
     class_name = "".join(part.capitalize() for part in name.split("_"))
     for path, text in files.items():
-        path.write_text(text.replace("CLASS", class_name).replace("NAME", name), encoding="utf-8")
+        with whole(path, overwrite=overwrite) as fresh:
+            fresh.write_text(text.replace("CLASS", class_name).replace("NAME", name), encoding="utf-8")
     program_path, test_path = files
     print(f"{program_path}: edit it; `pytest {test_path}` tests it without any process")
     print("into dataflow.yaml, under nodes:")

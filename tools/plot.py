@@ -16,6 +16,8 @@ from caneflow.algorithms.rotations import Vector
 from caneflow.algorithms.track_errors import START_NS, Track, boresight_yaws, track_errors
 from caneflow.errors import CaneflowError
 from caneflow.messages import GroundSpeed, Pose, RadarFrame
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.recording import TRUTH, Recording, RecordingError, Stream
 
 if TYPE_CHECKING:
@@ -91,22 +93,22 @@ class Picture:
 def command(
     recording: Annotated[Path, typer.Argument(metavar="REC", help="Recording to draw.", show_default=False)],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help=f"{', '.join(SUFFIXES)} to write.")],
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw a recording's track against the truth, its speed, its error over time and the radar's Doppler.
 
     A track is laid on the truth at its start, by position and yaw only, and its errors are printed: the last one,
-    the root mean square (ATE), and the paper's distance from end to start.
+    the root mean square (ATE), and the paper's distance from end to start. A picture of the same format is replaced;
+    any other file only with --overwrite.
 
     Example: caneflow plot track.mcap -o track.png
     """
     if output.suffix not in SUFFIXES:
         raise CaneflowError(f"{output}: a picture is one of {', '.join(SUFFIXES)}")
-    picture = read_picture(recording)
-    figure = draw(picture)
-    try:
-        figure.savefig(output, dpi=150)
-    except OSError as error:  # a full disk names no file
-        raise CaneflowError(f"{output}: cannot be written: {error.strerror or error}") from error
+    form = output.suffix[1:]
+    with whole(output, inputs=[recording], overwrite=overwrite, picture=form) as path:
+        picture = read_picture(recording)
+        draw(picture).savefig(path, dpi=150, format=form)
     for line in summary(picture):
         print(line)
 

@@ -10,16 +10,8 @@ from typing import Any, Literal
 import msgspec
 
 from caneflow.messages import Pose, Sample, sample_key
-from caneflow.recording import Recorded, Recording, RecordingError, RecordingWriter, require_writable
-from caneflow.recording.parts import (
-    LastSeconds,
-    RotatingWriter,
-    Rotation,
-    further_part,
-    part_path,
-    parts_of,
-    require_room,
-)
+from caneflow.recording import Recorded, Recording, RecordingError, RecordingWriter
+from caneflow.recording.parts import LastSeconds, RotatingWriter, Rotation, further_part, parts_of, require_room
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.node import run
 
@@ -95,7 +87,6 @@ class Recorder(Sink):
     def _writer_of(self, settings: RecordSettings) -> RecordingWriter | RotatingWriter | LastSeconds:
         path = Path(settings.path)
         if settings.last_s is not None:
-            require_writable(part_path(path, 0))
             return LastSeconds(path, settings.last_s, self._part)
         if settings.goes_on:
             require_room(path)
@@ -120,7 +111,7 @@ class Recorder(Sink):
     def _part(self, path: Path, number: int) -> RecordingWriter:
         settings = self._settings
         return RecordingWriter(
-            path, flow=settings.flow, source=settings.source, rig=settings.rig, run=self._run, part=number
+            path, flow=settings.flow, source=settings.source, rig=settings.rig, run=self._run, part=number, new=True
         )
 
     def _carry_truth(self, until: int, time: int) -> None:

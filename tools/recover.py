@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from caneflow.options import Overwrite
+from caneflow.outputs import whole
 from caneflow.recording import recover
 
 
@@ -16,13 +18,15 @@ def command(
         Path | None,
         typer.Option("--output", "-o", help="Sound recording to write; by default REC.recovered.mcap beside it."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Copy all that can be read of a recording into a sound one, with its metadata.
 
     Example: caneflow recover walk.mcap -o walk_sound.mcap
     """
     target = output or recording.with_suffix(".recovered.mcap")
-    found = recover(recording, target)
+    with whole(target, inputs=[recording], overwrite=overwrite) as sound:
+        found = recover(recording, sound)
     for key, count in found.messages.items():
         print(f"{count:8d}  {key}")
     state = "had not been cut" if found.complete else "was cut"

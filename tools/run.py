@@ -3,13 +3,17 @@
 import math
 import sys
 import time
-from contextlib import nullcontext
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from caneflow.messages.control import Counters
+from caneflow.options import Overwrite
+from caneflow.outputs import named_at, require_folder, require_no_input, reserved
 from caneflow.recording.parts import Rotation, read_span
 from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.loading import load, read_rig
@@ -49,7 +53,14 @@ def command(
         Path | None,
         typer.Option(metavar="DIR", help="with --machine: this machine's certificate [default: keys, beside the file]"),
     ] = None,
-    record: Annotated[Path | None, typer.Option(metavar="OUT", help="write every stream to this recording")] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT",
+            help="write every stream to this recording; {time} in its name is the time in UTC, 20261130T140501Z",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
     rotate: Annotated[
         str | None,
         typer.Option(metavar="100MB|10min", help="of --record: begin OUT_000, OUT_001 ... by size, time or both"),
@@ -77,14 +88,21 @@ def command(
     Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record out.mcap --set fusion.method=kalman
     """
     raise_limit()
-    # First: what is there now is there in every node.
-    with nullcontext() if in_process else Nursery() as nursery:
+    recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
+    if record is not None:
+        record = named_at(record, datetime.now(UTC))
+    # The recording's name first, before any process; then the nursery: what is there now is there in every node.
+    with (
+        _kept(record, [file, replay, rig], overwrite=overwrite, parts=bool(recorder)),
+        nullcontext() if in_process else Nursery() as nursery,
+    ):
         graph = load(file, settings or ())
         for warning in graph.warnings:
             print(warning, file=sys.stderr)
+        if record is not None:
+            require_no_input(record, [node.file for node in graph.nodes.values()])
         speed = speed or ("max" if in_process else "1")
         played = _replay(replay, speed, start, duration, loop=loop, without=without or [])
-        recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
         _check_machine(graph, machine, everything_here=in_process or played is not None)
         deployment = deploy(
             graph,
@@ -99,12 +117,24 @@ def command(
         started = time.monotonic()
         if nursery is None:
             programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
-            outcome = InProcess(deployment, programs).run()
+            outcome = InProcess(deployment, programs).run_until_interrupted()
         else:
             restarts = {name: node.restart for name, node in graph.nodes.items()}
             outcome = Launcher(deployment, restarts, report, nursery, keys or file.parent / "keys").run()
         summary(deployment, outcome, time.monotonic() - started)
         raise typer.Exit(outcome.status)
+
+
+def _kept(
+    record: Path | None, inputs: Sequence[Path | None], *, overwrite: bool, parts: bool
+) -> AbstractContextManager[None]:
+    """The recording's name is free, and this run's alone until its end; parts number themselves after what exists."""
+    if record is None:
+        return nullcontext()
+    if parts:
+        require_folder(record)
+        return nullcontext()
+    return reserved(record, inputs=inputs, overwrite=overwrite)
 
 
 def report(node: str, line: str) -> None:

@@ -1,7 +1,7 @@
 """`caneflow simulate`: recordings of walks that nobody walked, with the truth beside them."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
@@ -10,13 +10,16 @@ from rich.console import Console
 from rich.progress import Progress
 
 from caneflow.messages import DopplerBlock, Imu, Pose, RadarFrame, Sample, numbered, sample_key
-from caneflow.recording import TRUTH, RecordingWriter, require_writable
+from caneflow.options import Overwrite
+from caneflow.outputs import made_folder, require_free, whole
+from caneflow.recording import TRUTH, RecordingWriter
 from caneflow.simulation.doppler_module import Kind
 from caneflow.simulation.room_cane import CaneInRoom, simulate_cane_in_room
 from caneflow.simulation.room_course import RoomShape
 from caneflow.simulation.room_scenario import PARTS, SENSORS, Part, RoomRecording, World, room_settings, simulate_room
 from caneflow.simulation.scenario import SCENARIOS, Walk, simulate_walk
 
+RECORDING = ".mcap"  # the end of a file's name; another output of `simulate room` is a folder
 CANE, ROOM, CANE_IN_ROOM = "cane", "room", "cane_in_room"  # flows
 IMU, RADAR = ("imu", "imu"), ("radar", "frame")
 
@@ -31,6 +34,7 @@ def walk(
         float | None,
         typer.Option(metavar="S", min=0.1, help="s; by default until the course has been walked (swing: 53 s)."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate a walk with a white cane: IMU and radar at 100 Hz, and where the cane truly was.
 
@@ -38,10 +42,10 @@ def walk(
     """
     if scenario not in SCENARIOS:
         raise typer.BadParameter(f"no walk {scenario!r}; there are {', '.join(SCENARIOS)}", param_hint="--scenario")
-    require_writable(output)
-    with progress_bar(f"{scenario}, seed {seed}") as progress:
-        walked = simulate_walk(scenario, seed, duration, progress)
-    written(output, CANE, walked.rig, samples_of(walked))
+    with whole(output, overwrite=overwrite) as recording:
+        with progress_bar(f"{scenario}, seed {seed}") as progress:
+            walked = simulate_walk(scenario, seed, duration, progress)
+        written(recording, CANE, walked.rig, samples_of(walked))
     seconds = float(walked.stamps_ns[-1] - walked.stamps_ns[0]) / 1e9
     print(f"{output}: {scenario}, seed {seed}: {len(walked.stamps_ns)} samples a stream, {seconds:.2f} s")
 
@@ -70,6 +74,7 @@ def room(
     stops: Annotated[
         int | None, typer.Option(min=0, help="How often the person stands still; by default as fits the course.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate an installation of Doppler modules and a person in it, who wears an IMU.
 
@@ -77,14 +82,15 @@ def room(
     """
     settings = room_settings(course, modules=modules, sensors=sensors, world=world, stops=stops)
     names = room_names(output, f"{world}_{modules}{sensors}_{course}_{seed}", part)
-    for path in names.values():
-        require_writable(path)
-    for one, path in names.items():
-        with progress_bar(f"{one}, seed {seed}") as progress:
-            recorded = simulate_room(settings, one, seed, person, progress)
-            written(path, ROOM, recorded.rig, room_samples(recorded))
-        blocks = len(recorded.block_stamps_ns)
-        print(f"{path}: {one}, seed {seed}: {blocks} blocks a module, {len(recorded.stamps_ns) / 100:.2f} s")
+    with made_folder(output) if output.suffix != RECORDING else nullcontext():
+        for path in names.values():
+            require_free(path, overwrite=overwrite)
+        for one, path in names.items():
+            with whole(path, overwrite=overwrite) as recording, progress_bar(f"{one}, seed {seed}") as progress:
+                recorded = simulate_room(settings, one, seed, person, progress)
+                written(recording, ROOM, recorded.rig, room_samples(recorded))
+            blocks = len(recorded.block_stamps_ns)
+            print(f"{path}: {one}, seed {seed}: {blocks} blocks a module, {len(recorded.stamps_ns) / 100:.2f} s")
 
 
 def cane_in_room(
@@ -93,6 +99,7 @@ def cane_in_room(
     modules: Annotated[Kind, typer.Option(help="One mixer (int16) or two (complex64).")] = "real",
     sensors: Annotated[int, typer.Option(min=2, max=len(SENSORS), help=f"The first of {', '.join(SENSORS)}.")] = 2,
     world: Annotated[World, typer.Option(help="How strongly floor and walls reflect.")] = "nominal",
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate somebody with a white cane in a room of Doppler modules: both sensor sets, and where the person was.
 
@@ -101,19 +108,18 @@ def cane_in_room(
     Example: caneflow simulate cane_in_room --seed 3 -o cane_3.mcap
     """
     settings = room_settings(modules=modules, sensors=sensors, world=world)
-    require_writable(output)
-    with progress_bar(f"cane in room, seed {seed}") as progress:
-        walked = simulate_cane_in_room(settings, seed, progress=progress)
-    written(output, CANE_IN_ROOM, walked.rig, cane_in_room_samples(walked))
+    with whole(output, overwrite=overwrite) as recording:
+        with progress_bar(f"cane in room, seed {seed}") as progress:
+            walked = simulate_cane_in_room(settings, seed, progress=progress)
+        written(recording, CANE_IN_ROOM, walked.rig, cane_in_room_samples(walked))
     print(f"{output}: cane in room, seed {seed}: {len(walked.room.stamps_ns) / 100:.2f} s")
 
 
 def room_names(output: Path, name: str, part: Literal[Part, "all"]) -> dict[Part, Path]:
-    """The file of each part that is asked for. A folder is made where there is none; one part may have any name."""
+    """The file of each part that is asked for, in the folder `output` or named after the file; one part as it is."""
     base = output
-    if output.suffix != ".mcap":
-        output.mkdir(exist_ok=True)
-        base = output / f"{name}.mcap"
+    if output.suffix != RECORDING:
+        base = output / f"{name}{RECORDING}"
     elif part != "all":
         return {part: output}
     paths = {one: base if one == "course" else base.with_stem(f"{base.stem}_{one}") for one in PARTS}

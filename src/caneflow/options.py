@@ -1,4 +1,4 @@
-"""Options that several tools share: where the running flow is that they attach to, and with which key."""
+"""Options that several tools share: where the running flow is that they attach to, and whether files are replaced."""
 
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -12,3 +12,4 @@ At: TypeAlias = Annotated[
 Keys: TypeAlias = Annotated[
     Path, typer.Option("--keys", metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
 ]
+Overwrite: TypeAlias = Annotated[bool, typer.Option("--overwrite", help="Replace what exists under the output's name.")]

@@ -4,7 +4,7 @@ from caneflow.recording.errors import RecordingError
 from caneflow.recording.platform import Platform
 from caneflow.recording.reader import TRUTH, Recorded, Recording, Stream
 from caneflow.recording.recover import Recovered, recover
-from caneflow.recording.writer import Compression, Origin, RecordingWriter, require_writable
+from caneflow.recording.writer import Compression, Origin, RecordingWriter
 
 __all__ = [
     "TRUTH",
@@ -18,5 +18,4 @@ __all__ = [
     "Recovered",
     "Stream",
     "recover",
-    "require_writable",
 ]

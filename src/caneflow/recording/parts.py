@@ -4,7 +4,8 @@ import errno
 import os
 import re
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -19,7 +20,8 @@ SPANS = {"s": 1, "min": 60, "h": 3600}  # s
 LEAST_ROOM = 512 * 1024  # bytes on a disk that has been full, before a recorder begins another part there
 LARGEST_BUFFER = 512 * 2**20  # bytes of samples that are kept in memory: a gateway has more to do
 
-Opener: TypeAlias = Callable[[Path, int], RecordingWriter]  # path and number of a part -> its writer
+# Path and number of a part -> its writer; raises FileExistsError where another run was faster.
+Opener: TypeAlias = Callable[[Path, int], RecordingWriter]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +68,7 @@ def parts_of(path: Path) -> list[Path]:
 
 def further_part(path: Path, opener: Opener) -> RecordingWriter:
     """The part that follows `path` itself and its parts that are there: walk_001.mcap after walk.mcap."""
-    number = next(_free_numbers(path, first=1))
-    return opener(part_path(path, number), number)
+    return _opened(opener, path, _free_numbers(path, first=1))
 
 
 def require_room(path: Path) -> None:
@@ -123,12 +124,11 @@ class RotatingWriter:
             self._began = log_time
 
     def _next_part(self) -> RecordingWriter:
-        number = next(self._numbers)
-        path = part_path(self._path, number)
         while self._rotation.keep is not None and len(self._written) >= self._rotation.keep:
             self._written.popleft().unlink(missing_ok=True)
-        self._written.append(path)
-        return self._open(path, number)
+        writer = _opened(self._open, self._path, self._numbers)
+        self._written.append(writer.path)
+        return writer
 
 
 class Kept(NamedTuple):
@@ -185,9 +185,7 @@ class LastSeconds:
         """Write what is kept to a new part; raises RecordingError when nothing is, or it cannot be written."""
         if not self._kept:
             raise RecordingError("nothing has come yet; there is nothing to write")
-        number = next(self._numbers)
-        path = part_path(self.path, number)
-        with self.opener(path, number) as writer:
+        with _opened(self.opener, self.path, self._numbers) as writer:
             for kept in self._kept:
                 if isinstance(kept.kind, str):
                     writer.write_control(kept.key, kept.kind, kept.payload, log_time=kept.log_time)
@@ -195,7 +193,7 @@ class LastSeconds:
                     writer.write(
                         kept.key, kept.kind, kept.payload, stamp=kept.stamp, seq=kept.seq, log_time=kept.log_time
                     )
-        return Snapshot(path, len(self._kept), (self._kept[-1].log_time - self._kept[0].log_time) / 1e9)
+        return Snapshot(writer.path, len(self._kept), (self._kept[-1].log_time - self._kept[0].log_time) / 1e9)
 
     def _keep(self, kept: Kept) -> None:
         self._kept.append(kept)
@@ -209,6 +207,14 @@ class LastSeconds:
 
     def _forget(self) -> None:
         self._size -= len(self._kept.popleft().payload)
+
+
+def _opened(opener: Opener, path: Path, numbers: Iterator[int]) -> RecordingWriter:
+    """The writer of the next part whose name is free: runs that write beside each other share the numbers."""
+    for number in numbers:
+        with suppress(FileExistsError):
+            return opener(part_path(path, number), number)
+    raise AssertionError  # there is always another number
 
 
 def _free_numbers(path: Path, first: int = 0) -> "count[int]":

@@ -15,6 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 import caneflow
 from caneflow.messages import Sample, json_schema
+from caneflow.outputs import FULL, share_lock
 from caneflow.recording.errors import RecordingError
 from caneflow.recording.platform import Platform
 
@@ -25,13 +26,12 @@ FORMAT_VERSION = "1"  # of the layout of a recording; the program's own version 
 FLUSH_INTERVAL = 1_000_000_000  # ns of log time: what a killed recorder may lose
 # A second of the cane is 0.2 MB, so most chunks end with a flush; a burst ends here, for the reader's memory.
 CHUNK_SIZE = 256 * 1024  # bytes before compression
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MAX_SEQUENCE = 2**32 - 1  # MCAP's sequence is a uint32; a stream of 100 Hz gets there after 16 months
 
 
 class RecordingWriter:
-    """One file, written from one thread. An existing file is replaced.
+    """One file, written in place and from one thread. What exists is replaced: `caneflow.outputs` decides about that.
 
     Metadata is on disk before the first sample, and samples are at most FLUSH_INTERVAL of log time later than
     that; `flush` puts them there at once. Leaving the `with` block ends the file soundly, whatever happened in it.
@@ -49,8 +49,9 @@ class RecordingWriter:
         run: str | None = None,
         compression: Compression = "zstd",
         part: int | None = None,
+        new: bool = False,
     ) -> None:
-        """`part`: which of the files of one run this is."""
+        """`part`: which of the files of one run this is. `new`: raise FileExistsError where there is a file."""
         about = {"flow": flow, "version": FORMAT_VERSION, "run": run or uuid.uuid4().hex, "source": source}
         if part is not None:
             about["part"] = str(part)
@@ -62,9 +63,12 @@ class RecordingWriter:
         self._flushed: int | None = None  # log time, ns
         try:
             # A buffered file: of an unbuffered one, mcap would leave the end in a buffer that nobody flushes.
-            self._file = self.path.open("wb")
+            self._file = self.path.open("xb" if new else "wb")
         except OSError as error:
+            if new and isinstance(error, FileExistsError):
+                raise
             raise RecordingError(_cannot_open(self.path, error)) from error
+        share_lock(self._file.fileno())
         self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE, compression=COMPRESSIONS[compression])
         try:
             with self._ending_at_failure():
@@ -163,18 +167,6 @@ class RecordingWriter:
                 f"{self.path}: {error.strerror or error}; the recording ends here, what was written before can be read"
                 f"{advice}"
             ) from error
-
-
-def require_writable(path: str | Path) -> None:
-    """Raise RecordingError if no recording can be written at `path`: before the work that would fill it."""
-    path = Path(path)
-    was_there = path.exists()
-    try:
-        path.open("ab").close()
-        if not was_there:
-            path.unlink()
-    except OSError as error:
-        raise RecordingError(_cannot_open(path, error)) from error
 
 
 def _cannot_open(path: Path, error: OSError) -> str:

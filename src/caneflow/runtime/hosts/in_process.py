@@ -50,7 +50,14 @@ class InProcess:
                 self._wires.setdefault((wire.writer, wire.key.rpartition("/")[2]), []).append((reader, port))
 
     def run(self) -> Outcome:
-        """Run to the end of the recording."""
+        """Run to the end of the recording; raises KeyboardInterrupt when that is not reached because of a signal."""
+        outcome = self.run_until_interrupted()
+        if outcome.interrupted:  # a part is never taken for the whole
+            raise KeyboardInterrupt
+        return outcome
+
+    def run_until_interrupted(self) -> Outcome:
+        """The same; after a signal the outcome says so, and holds what was counted up to there."""
         outcome = Outcome()
         try:
             self._run()

@@ -31,6 +31,7 @@ PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal for a process whose parent d
 PLAN = 3  # the descriptor under which a process finds its plan
 PLAN_PATH = f"/proc/self/fd/{PLAN}"
 RESET = (signal.SIGTERM, signal.SIGCHLD)
+FROM_OUTSIDE = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}  # what the launcher's process has handlers for
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):
@@ -52,11 +53,14 @@ class Nursery:
     def __init__(self) -> None:
         """Fork the nursery; to be done before this process has any thread."""
         self._socket, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # Ctrl-C reaches both processes: the nursery must not take it as the launcher would.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, FROM_OUTSIDE)
         self.pid = os.fork()
         if self.pid == 0:
             self._socket.close()
             _end(lambda: _Parent(inner).serve())
         inner.close()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __enter__(self) -> "Nursery":
         return self
@@ -104,6 +108,9 @@ class _Parent:
         os.setsid()
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup has it
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, FROM_OUTSIDE)
         with Path(os.devnull).open("rb") as nothing:
             os.dup2(nothing.fileno(), 0)
         woken, waker = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)

@@ -180,8 +180,6 @@ def _run(graph: Graph, recording: Path, methods: Sequence[str]) -> Mapping[str, 
     programs = {name: node.program for name, node in side_by_side.nodes.items() if node.program is not None}
     deployment = deploy(side_by_side, replay=Replay(recording=recording, speed=math.inf))
     outcome = InProcess(deployment, programs).run()
-    if outcome.interrupted:
-        raise KeyboardInterrupt
     if outcome.failures:
         raise DataflowError("; ".join(outcome.failures))
     return poses

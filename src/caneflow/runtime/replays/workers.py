@@ -3,8 +3,10 @@
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import connection, get_context, parent_process
 from typing import TypeVar
 
@@ -18,17 +20,26 @@ Made = TypeVar("Made")
 def mapped(function: Callable[[Given], Made], items: Sequence[Given], jobs: int) -> Iterator[Made]:
     """`function` of each item, in their order; with `jobs` > 1 in as many processes, to which both are pickled.
 
-    When the iteration is left early, what has not been started is not started any more.
+    When the iteration is left early, the processes end at once.
     """
     if jobs == 1 or len(items) < 2:
         yield from map(function, items)
         return
     # spawn: a fork would copy threads and locks of numpy's and Zenoh's in whatever state they are
-    with ProcessPoolExecutor(min(jobs, len(items)), get_context("spawn"), _end_with_parent) as pool:
+    spawn = get_context("spawn")
+    end, ender = spawn.Pipe(duplex=False)
+    with (
+        end,
+        ender,
+        ProcessPoolExecutor(min(jobs, len(items)), spawn, initializer=_end_with_parent, initargs=(end,)) as pool,
+    ):
         try:
-            yield from pool.map(function, items)
+            with _signals_wait():  # also in the workers, from their first instruction on: they end with their parent
+                futures = deque(pool.submit(function, item) for item in items)  # starts them
+            while futures:
+                yield futures.popleft().result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            ender.close()  # the workers hear of it and end; a future that was cancelled would confuse the pool then
             raise
 
 
@@ -61,14 +72,23 @@ def mapped_on_cluster(
             raise
 
 
-def _end_with_parent() -> None:
-    """Let Ctrl-C end this process at once and in silence, and the death of its parent as well, however it died."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_follow_parent, daemon=True).start()
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Inside, Ctrl-C waits until the end; processes that are started inside never hear of it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _follow_parent() -> None:
+def _end_with_parent(end: connection.Connection) -> None:
+    """Let this process end at once and in silence when its parent says so or dies, however it died."""
+    threading.Thread(target=_follow_parent, args=(end,), daemon=True).start()
+
+
+def _follow_parent(end: connection.Connection) -> None:
     parent = parent_process()
     assert parent is not None
-    connection.wait([parent.sentinel])
+    connection.wait([parent.sentinel, end])
     os._exit(1)
