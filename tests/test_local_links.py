@@ -250,10 +250,7 @@ def test_a_removed_folder_is_said_once_and_a_node_that_then_ends_ends_the_flow(
     os.kill(processes["ticker"].pid, signal.SIGKILL)
     assert launched.ends(30) == 1
     assert launched.said.count("was removed: the flow goes on") == 1
-    assert (
-        f"caneflow run: ticker cannot be started: {target.folder}/ticker.json: the folder of the run was"
-        in launched.said
-    )
+    assert f"caneflow run: ticker cannot be started: the run's folder {target.folder}, where" in launched.said
     assert "Traceback" not in launched.said
 
 

@@ -7,7 +7,6 @@ import pwd
 import shutil
 import stat
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -50,7 +49,8 @@ def common(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @contextmanager
 def process_of(user: int) -> Iterator[int]:
     """The pid of a process of another user."""
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, user=user) as process:
+    # `cat`, as the interpreter may lie where only root comes to.
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE, user=user) as process:
         yield process.pid
         process.kill()
 
