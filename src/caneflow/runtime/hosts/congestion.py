@@ -8,8 +8,9 @@ flow's own nodes and launchers have ids that are known beforehand, and every oth
 
 import socket
 import struct
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ ID_BYTES = 16  # of a Zenoh session's id
 # that is started again takes another id of its own.
 NODE_STARTS = 16  # ids that a node takes in turn
 LAUNCHER_STARTS = 256  # ids of a machine's launcher, of which it takes a random one
+LAST_SAMPLES = 1.0  # s that tools have to take what is still on its way when a launcher ends
+STANDARD_STREAMS = 2  # the last of their file descriptors: a service's may be sockets, and are none of Zenoh's
 
 
 def node_id(run: str, node: str, start: int) -> str:
@@ -91,14 +94,59 @@ def closing_at_once(session: zenoh.Session) -> object:
     return session.info.declare_link_events_listener(handler, history=True)
 
 
+@contextmanager
+def closed_in_time(session: zenoh.Session, listens: Iterable[str]) -> Iterator[zenoh.Session]:
+    """A launcher's session for a block, then closed; a tool that does not take the last samples is cut off.
+
+    Zenoh alone waits 10 s for one that is frozen and not yet given up, and then fails. `listens`: its own endpoints.
+    """
+    try:
+        yield session
+    finally:
+        closing = threading.Thread(target=_close, args=(session,))
+        closing.start()
+        closing.join(LAST_SAMPLES)
+        if closing.is_alive():
+            _cut_links({endpoint.partition("/")[2] for endpoint in listens})
+            closing.join()
+
+
+def _close(session: zenoh.Session) -> None:
+    with suppress(zenoh.ZError):  # it could not say goodbye to somebody
+        session.close()  # type: ignore[no-untyped-call]  # the stub lacks its types
+
+
+def _cut_links(own_paths: Iterable[str]) -> None:
+    """End every TCP link of this process, and those over the Unix sockets `own_paths`."""
+    paths = set(own_paths)
+
+    def cut(link: socket.socket) -> None:
+        if link.family != socket.AF_UNIX or link.getsockname() in paths:
+            link.shutdown(socket.SHUT_RDWR)
+
+    _with_each_link(cut)
+
+
 def _end_lingering(_: zenoh.LinkEvent) -> None:
     """Switch the wait off on every TCP socket of this process."""
-    for path in Path("/proc/self/fd").iterdir():
+
+    def end(link: socket.socket) -> None:
+        if link.family != socket.AF_UNIX:
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+
+    _with_each_link(end)
+
+
+def _with_each_link(act: Callable[[socket.socket], None]) -> None:
+    """Let `act` have each connected stream socket of this process, but for the standard streams."""
+    for number in sorted(int(path.name) for path in Path("/proc/self/fd").iterdir()):
+        if number <= STANDARD_STREAMS:
+            continue
         with suppress(OSError):  # it is no socket, or closed meanwhile
-            link = socket.socket(fileno=int(path.name))
+            link = socket.socket(fileno=number)
             try:
-                if link.family in (socket.AF_INET, socket.AF_INET6) and link.type == socket.SOCK_STREAM:
-                    link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                if link.type == socket.SOCK_STREAM and not link.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+                    act(link)
             finally:
                 link.detach()
 

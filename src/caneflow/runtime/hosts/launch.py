@@ -27,7 +27,14 @@ from caneflow.runtime.deployment import (
 )
 from caneflow.runtime.hosts import last_words
 from caneflow.runtime.hosts.clocks import Answer, Clocks
-from caneflow.runtime.hosts.congestion import closing_at_once, launcher_ids, node_id, node_ids, tool_links
+from caneflow.runtime.hosts.congestion import (
+    closed_in_time,
+    closing_at_once,
+    launcher_ids,
+    node_id,
+    node_ids,
+    tool_links,
+)
 from caneflow.runtime.hosts.last_words import LastWords
 from caneflow.runtime.hosts.links import local_links, open_session, protocol
 from caneflow.runtime.hosts.machines import (
@@ -184,7 +191,7 @@ class Launcher:
         with (
             RunDirectory(self._deployment.flow) as self._directory,
             local_links(self._deployment.links, self._directory.path) as ports,
-            self._open_session(endpoint := ports.endpoint()) as self._session,
+            closed_in_time(self._open_session(endpoint := ports.endpoint()), [endpoint]) as self._session,
             self._subscribed(),
             self._directory.announced(endpoint),  # tools may attach from here on
             Processes(self._events, self._nursery) as self._processes,
