@@ -15,7 +15,6 @@ from caneflow.messages import GroundSpeed, Imu, Sample, numbered
 from caneflow.runtime import Context, Emitted, Operator, node
 from caneflow.runtime.hosts.bus import Arrived, Event
 from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
-from caneflow.runtime.stages import snapshot_keeper
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.snapshot_keeper import LAYOUT, Snapshot, SnapshotKeeper
 
@@ -274,7 +273,7 @@ def test_half_a_snapshot_is_not_left_behind(make: Make, folder: Path, monkeypatc
     host = make()
     take(host, 0)
     with monkeypatch.context() as full:
-        full.setattr(snapshot_keeper.os, "replace", no_room)
+        full.setattr(os, "replace", no_room)
         take(host, 1)
     assert os.listdir(folder) == ["adder.snapshot"]  # noqa: PTH208 - names alone
 
@@ -343,7 +342,12 @@ def test_a_snapshot_that_an_error_follows_is_not_gone_on_from_again(
     host = make()
     if kept_since:
         handle_all = host.handle_all
-        host.handle_all = lambda *, resumed: (take(host, 1), handle_all(resumed=resumed))
+
+        def keep_one_and_go_on(*, resumed: bool) -> None:
+            take(host, 1)
+            handle_all(resumed=resumed)
+
+        host.handle_all = keep_one_and_go_on
     with pytest.raises(ZeroDivisionError):
         host.run()
     assert (folder / "adder.snapshot").exists() is kept_since
