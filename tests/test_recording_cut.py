@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 
 from caneflow.messages import Imu, numbered
-from caneflow.recording import Recording, RecordingError, RecordingWriter, recover, writer
+from caneflow.recording import NothingLeftError, Recording, RecordingError, RecordingWriter, recover, writer
 
 SAMPLES = 40
 Read = list[tuple[int, bytes]]  # stamp, payload
@@ -183,3 +183,53 @@ def test_recover_does_not_overwrite_what_it_reads(tmp_path: Path, sound: tuple[b
     with pytest.raises(RecordingError, match="is the file to recover; give the sound one another name"):
         recover(path, path)
     assert path.read_bytes() == sound[0]
+
+
+def test_what_recover_writes_is_read_whatever_the_cut(tmp_path: Path, sound: tuple[bytes, Read]) -> None:
+    """All that came before the cut with its flow and rig, or no file and the word that nothing is left."""
+    whole, samples = sound
+    path, target = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
+    kept: list[int] = []
+    for cut in (*range(500), *range(500, len(whole), 11), len(whole)):
+        path.write_bytes(whole[:cut])
+        try:
+            found = recover(path, target)
+        except RecordingError as error:
+            assert isinstance(error, NothingLeftError) or cut < 8, "or it is no MCAP file yet"
+            assert "nothing to recover" in str(error) or cut < 8
+            assert not target.exists()
+            assert not kept, "what is longer has more"
+            continue
+        got = read(target)
+        with Recording(target) as recording:
+            assert (recording.complete, recording.flow, recording.rig) == (True, "cane", {})
+            assert recording.metadata["source"] == "live"
+        assert found.messages.get("cane/imu/imu", 0) == len(got)
+        assert found.replaced == ()
+        assert got == samples[: len(got)]
+        target.unlink()
+        kept.append(len(got))
+    assert kept == sorted(kept)
+    assert (kept[0], kept[-1]) == (0, SAMPLES)
+
+
+@pytest.mark.parametrize("lost", ["caneflow", "rig"])
+def test_lost_metadata_is_made_up_when_there_are_samples(tmp_path: Path, sound: tuple[bytes, Read], lost: str) -> None:
+    """The flow's name stands in the keys."""
+    path, target = tmp_path / "damaged.mcap", tmp_path / "saved.mcap"
+    name = len(lost).to_bytes(4, "little") + lost.encode()
+    path.write_bytes(sound[0].replace(name, b"\xff" * 4 + lost.encode()))
+    assert recover(path, target).replaced == (lost,)
+    assert read(target) == sound[1]
+    with Recording(target) as recording:
+        assert (recording.flow, recording.rig) == ("cane", {})
+
+
+def test_two_flows_in_one_file_are_no_recording(tmp_path: Path) -> None:
+    path, target = tmp_path / "two.mcap", tmp_path / "saved.mcap"
+    with RecordingWriter(path, flow="one", source="live", rig={}) as writing:
+        for flow in ("one", "two"):
+            writing.write(f"{flow}/imu/imu", Imu, numbered(Imu(stamp=1, gyro=(0, 0, 0)), 0), stamp=1, seq=0, log_time=1)
+    with pytest.raises(NothingLeftError, match="what is left of it is no recording: both one/imu/imu and two/imu/imu"):
+        recover(path, target)
+    assert not target.exists()

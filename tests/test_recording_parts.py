@@ -20,6 +20,7 @@ from caneflow.messages.rig import read_rig
 from caneflow.recording import Recording, RecordingError, RecordingWriter
 from caneflow.recording.layout import Block, Content, Declarations, content_of
 from caneflow.recording.parts import LastSeconds, RotatingWriter, Rotation, part_path, read_span
+from caneflow.recording.reader import GLANCE_BLOCKS
 from caneflow.runtime import Context
 from tools.record import WRITE_NOW, Recorder, RecordSettings
 
@@ -265,10 +266,10 @@ def test_record_without_now_says_what_it_does(caneflow: Callable[..., Run]) -> N
     assert caneflow("record") == (2, "", said)
 
 
-def test_info_of_a_large_file_reads_its_ends_only(
+def test_info_of_a_large_file_reads_little_of_it(
     caneflow: Callable[..., Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """20 minutes in over 1000 chunks: what is unpacked is the first and the last one."""
+    """20 minutes in over 1000 chunks: what is unpacked is the first, the last and some between them."""
     path = tmp_path / "long.mcap"
     with RecordingWriter(path, flow="cane", source="live", rig={}) as writer:
         for seq in range(0, 12_000):
@@ -283,7 +284,7 @@ def test_info_of_a_large_file_reads_its_ends_only(
 
     monkeypatch.setattr("caneflow.recording.reader.content_of", counting)
     about = json.loads(caneflow("info", path, "--json")[1])
-    assert len(unpacked) == 2
+    assert len(unpacked) <= 2 + GLANCE_BLOCKS
     (stream,) = about["streams"]
     assert (stream["count"], stream["missing"], stream["restarts"]) == (11_997, 3, None)
     assert stream["rate"] == pytest.approx(10, rel=1e-3)

@@ -23,9 +23,10 @@ from caneflow.algorithms.room_calibration import (
 from caneflow.algorithms.room_tracking import StaticSensor
 from caneflow.errors import CaneflowError
 from caneflow.messages import DopplerBlock, Pose
-from caneflow.messages.rig import Rig, read_rig
+from caneflow.messages.rig import Rig
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
+from caneflow.printable import printable
 from caneflow.recording import TRUTH, Recording
 
 BLOCK = "block"  # the port of a Doppler module
@@ -67,8 +68,9 @@ def room(
         found = {name: calibrated(name, rig, floors[name], walks, starts) for name in rig.sensors}
         path.write_text(rig_yaml(rig, {name: each.k for name, each in found.items()}), encoding="utf-8")
     print(f"{'sensor':10}{'k':>10}{'spread':>10}{'exponent':>10}{'hops':>7}{'floor':>10}")
-    for name, each in found.items():
-        floor = 10.0 * math.log10(float(np.median(floors[name])))
+    for sensor, each in found.items():
+        name = printable(sensor)
+        floor = 10.0 * math.log10(float(np.median(floors[sensor])))
         print(f"{name:10}{each.k:10.4g}{each.spread:7.1f} dB{each.exponent:10.1f}{each.hops:7}{floor:7.1f} dB")
     print(f"{output}: for `caneflow run --rig {output}`; the floor is that of one line, full scale = 0 dB")
 
@@ -76,7 +78,7 @@ def room(
 def room_rig(recording: Path) -> Rig:
     """The rig in a recording; raises CalibrationError when it knows of no sensor."""
     with Recording(recording) as opened:
-        rig = read_rig(opened.rig)
+        rig = opened.validated_rig()
     if not rig.sensors:
         raise CalibrationError(f"{recording}: its rig has no sensors; record with a dataflow that has rig.sensors")
     return rig

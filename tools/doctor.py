@@ -13,6 +13,7 @@ from caneflow.errors import CaneflowError
 from caneflow.examinations import bno055, doppler_adc, mpu9250, p440
 from caneflow.examinations.samples import examine_samples
 from caneflow.options import At, Keys
+from caneflow.printable import printable
 from caneflow.runtime import Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.dataflow.loading import load
@@ -105,6 +106,6 @@ def _nothing(node: Node) -> Iterator[Finding]:
 
 
 def _lines(finding: Finding) -> Iterator[str]:
-    yield f"{finding.node}: {finding.state:4} {finding.text}"
+    yield printable(f"{finding.node}: {finding.state:4} {finding.text}")
     for attempt in finding.attempts:
-        yield f"{'':{len(finding.node) + 2}}try  {attempt}"
+        yield f"{'':{len(finding.node) + 2}}try  {printable(attempt)}"

@@ -16,6 +16,7 @@ import typer
 from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, MessageError, Sample, decode
 from caneflow.options import At, Keys
+from caneflow.printable import printable
 from caneflow.runtime.hosts.attach import ANY, DEFAULT_KEYS, Heard, attached, parted
 
 MOST_WAITING = 10_000  # samples that may wait to be printed
@@ -59,7 +60,7 @@ def command(
                     heard = inbox.get(timeout=min(0.2, max(0.0, until - time.monotonic())))
                 except queue.Empty:
                     continue
-                print(told(heard, kinds, as_json=as_json), flush=True)
+                print(printable(told(heard, kinds, as_json=as_json)), flush=True)
                 printed += 1
                 missed.take(heard)
         if not printed:

@@ -16,6 +16,7 @@ from rich.progress import track
 from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
 from caneflow.options import Overwrite
 from caneflow.outputs import require_no_input, whole
+from caneflow.printable import printable
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.replays.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated
 from caneflow.runtime.replays.results_file import ResultsFile
@@ -106,7 +107,7 @@ def command(
         print("\n".join(lines(by_method)))
     failures = [line for result in done for line in failed(result)]
     for line in failures:
-        print(f"caneflow eval: {line}", file=sys.stderr)
+        print(f"caneflow eval: {printable(line)}", file=sys.stderr)
     if failures:
         raise typer.Exit(FAILED_STATUS)
 

@@ -18,6 +18,7 @@ from caneflow.errors import CaneflowError
 from caneflow.messages import GroundSpeed, Pose, RadarFrame
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
+from caneflow.printable import printable
 from caneflow.recording import TRUTH, Recording, RecordingError, Stream
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ COLOURS = (
     "#e69f00",
 )  # told apart by the colour-blind too (Okabe, Ito)
 UNOBSERVED = 1e5  # m^2/s^2: a velocity with this variance was not measured (wire: 1e6)
+
+MOST_TRACKS = 20  # more cannot be told apart
 
 SLOW_TIME = 64  # scans of one spectrum: 0.64 s of a cane
 SPECTRUM = 256  # lines of one spectrum
@@ -138,7 +141,7 @@ def _errors_of_a_walk(track: Track, truth: Track, picture: Picture) -> str:
 def read_picture(path: Path) -> Picture:
     """What there is to draw in the recording at `path`; raises RecordingError when nobody's position is in it."""
     with Recording(path) as recording:
-        poses = [stream for stream in recording.streams_of(Pose) if stream.count > 1]
+        poses = [stream for stream in recording.streams_of(Pose) if stream.count > 1][:MOST_TRACKS]
         truth = recording.streams.get(TRUTH)
         truth = truth if truth and truth.count > 1 else None
         span = recording.span()
@@ -147,27 +150,24 @@ def read_picture(path: Path) -> Picture:
                 f"{path}: no track to draw, there are no poses in it; "
                 f"`caneflow run dataflow.yaml --replay {path} --record track.mcap` makes some"
             )
+        rig = recording.validated_rig()
         picture = Picture(
-            title=f"{path.name}   {recording.flow}, {recording.metadata.get('source', '')}",
+            title=f"{printable(path.name)}   {recording.flow}, {recording.metadata.get('source', '')}",
             origin=span[0],
-            boresight=cast("Vector", tuple(recording.rig.get("boresight", (0.0, 1.0, 0.0)))),
-            sensors=_sensors(recording.rig),
+            boresight=rig.boresight,
+            sensors={printable(name): (each.position[0], each.position[1]) for name, each in rig.sensors.items()},
         )
         for stream in poses:
             track, _, method = _track(recording, stream)
-            picture.tracks[f"{stream.node}/{stream.port} {method}"] = track
+            picture.tracks[f"{stream.node}/{stream.port} {printable(method)}"] = track
         if truth:
             picture.truth, velocities, _ = _track(recording, truth)
             picture.truth_speed = None if picture.sensors else _along_boresight(picture, velocities)
-        for stream in recording.streams_of(GroundSpeed):
+        for stream in recording.streams_of(GroundSpeed)[:MOST_TRACKS]:
             picture.speeds[f"{stream.node}/{stream.port}"] = _speeds(recording, stream, span[0])
         for stream in recording.streams_of(RadarFrame)[:1]:
             picture.doppler = _doppler(recording, stream, span[0])
     return picture
-
-
-def _sensors(rig: dict[str, Any]) -> dict[str, tuple[float, float]]:
-    return {name: (each["position"][0], each["position"][1]) for name, each in rig.get("sensors", {}).items()}
 
 
 def _track(recording: Recording, stream: Stream) -> tuple[Track, Floats, str]:
@@ -238,10 +238,12 @@ def _spectrum(scans: NDArray[Any], frame: RadarFrame) -> Floats:
 def draw(picture: Picture) -> "Figure":
     """The figure: the track on the left, time series on the right, as many as there are data for."""
     try:
+        from matplotlib import rcParams
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
         raise CaneflowError(f"no {error.name} here; `pip install 'caneflow[plot]'` brings it") from error
 
+    rcParams["text.parse_math"] = False  # a name with a $ is a name
     panels = list(_panels(picture))
     figure = Figure(figsize=(14, 7.5), layout="constrained", facecolor="white")
     figure.suptitle(picture.title, x=0.01, ha="left", color=INK, fontsize=12)

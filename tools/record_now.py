@@ -8,6 +8,7 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.options import At, Keys
+from caneflow.printable import printable
 from caneflow.runtime.hosts.attach import DEFAULT_KEYS, attached
 
 WRITE_NOW = b"write now"  # what the recorder understands
@@ -41,7 +42,8 @@ def command(
         print(json.dumps(answers))
     else:
         for answer in answers:
-            print(answer.get("error") or f"{answer['path']}: {answer['samples']} samples, {answer['span']:.1f} s")
+            said = answer.get("error") or f"{answer['path']}: {answer['samples']} samples, {answer['span']:.1f} s"
+            print(printable(said))
     if any("error" in answer for answer in answers):
         raise typer.Exit(1)
 

@@ -14,6 +14,7 @@ import typer
 from caneflow.messages.control import Counters
 from caneflow.options import Overwrite
 from caneflow.outputs import named_at, require_folder, require_no_input, reserved
+from caneflow.printable import printable
 from caneflow.recording.parts import Rotation, read_span
 from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.loading import load, read_rig
@@ -139,7 +140,12 @@ def _kept(
 
 def report(node: str, line: str) -> None:
     """Print a node's line under its name."""
-    print(f"{node} | {line}", file=sys.stderr, flush=True)
+    print(f"{node} | {_visible(line)}", file=sys.stderr, flush=True)
+
+
+def _visible(line: str) -> str:
+    """A line of a node's as the terminal can show it; its indentation stays."""
+    return printable(line.expandtabs())
 
 
 def summary(deployment: Deployment, outcome: Outcome, took_s: float) -> None:
@@ -148,7 +154,7 @@ def summary(deployment: Deployment, outcome: Outcome, took_s: float) -> None:
         if text := _counted(counters):
             print(f"{node}: {text}", flush=True)  # before the failures, wherever both go
     for failure in (*outcome.unrecorded, *outcome.failures):
-        print(f"caneflow run: {failure}", file=sys.stderr)
+        print(f"caneflow run: {printable(failure)}", file=sys.stderr)
     if not outcome.failures and not outcome.interrupted:
         print(f"{deployment.flow}: ran to its end in {took_s:.1f} s")
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from caneflow.printable import printable
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.replays.verification import ACROSS_PLATFORMS, Verdict, verify
 
@@ -47,7 +48,7 @@ def command(
             print(f"another platform: {'; '.join(verification.differences)}")
             print(f"numbers may differ by {verification.tolerance:g}, each in its own SI unit")
         for verdict in verification.verdicts:
-            print(f"{verdict.stream}: {_said(verdict)}")
+            print(printable(f"{verdict.stream}: {_said(verdict)}"))
     raise typer.Exit(0 if verification.holds else 1)
 
 

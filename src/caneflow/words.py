@@ -13,6 +13,7 @@ from typer.core import TyperCommand, TyperGroup
 import caneflow
 from caneflow import interrupts
 from caneflow.errors import CaneflowError
+from caneflow.printable import printable
 
 TOOLS = "caneflow.tools"
 USAGE_STATUS = 2  # exit status of an expected error, as of a misspelt option
@@ -83,7 +84,7 @@ def run() -> NoReturn:
         _explain(error)
     except CaneflowError as error:
         if getattr(error, "problems", ()):  # each line begins with its own file:line:column
-            print(error, file=sys.stderr)
+            print("\n".join(map(printable, str(error).split("\n"))), file=sys.stderr)
             sys.exit(USAGE_STATUS)
         _fail(str(error))
     except OSError as error:
@@ -103,13 +104,14 @@ def _explain(error: Any) -> NoReturn:
     else:
         words = " ".join(error.format_message().split()).removesuffix(".")
         joint = " See" if words.endswith("?") else "; see"
-        print(f"{context.command_path}: {words}{joint} `{context.command_path} --help`", file=sys.stderr)
+        print(f"{context.command_path}: {printable(words)}{joint} `{context.command_path} --help`", file=sys.stderr)
     sys.exit(USAGE_STATUS)
 
 
 def _fail(message: str) -> NoReturn:
     word = next((argument for argument in sys.argv[1:] if argument in WORDS), None)
-    print(f"caneflow {word}: {message}" if word else f"caneflow: {message}", file=sys.stderr)
+    said = printable(message)
+    print(f"caneflow {word}: {said}" if word else f"caneflow: {said}", file=sys.stderr)
     sys.exit(USAGE_STATUS)
 
 

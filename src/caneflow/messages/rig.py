@@ -10,6 +10,8 @@ from caneflow.messages.samples import Vector3
 
 Area = tuple[float, float, float, float]
 
+MOST_CAUSES = 20  # that are told of one rig
+
 
 class Sensor(BaseModel):
     """One static Doppler module of a room."""
@@ -77,8 +79,10 @@ def read_rig(values: Mapping[str, object]) -> Rig:
     try:
         return Rig.model_validate(known)
     except ValidationError as error:
-        causes = (f"rig.{'.'.join(map(str, cause['loc']))}: {cause['msg']}" for cause in error.errors())
-        raise MessageError("; ".join(causes)) from error
+        errors = error.errors(include_url=False, include_input=False)
+        causes = [f"rig.{'.'.join(map(str, cause['loc']))}: {cause['msg']}" for cause in errors[:MOST_CAUSES]]
+        more = [f"and {len(errors) - MOST_CAUSES} more"] if len(errors) > MOST_CAUSES else []
+        raise MessageError("; ".join(causes + more)) from error
 
 
 def overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from caneflow.recording.errors import RecordingError
 from caneflow.recording.platform import Platform
 from caneflow.recording.reader import TRUTH, Recorded, Recording, Stream
-from caneflow.recording.recover import Recovered, recover
+from caneflow.recording.recover import NothingLeftError, Recovered, recover
 from caneflow.recording.writer import Compression, Origin, RecordingWriter
 
 __all__ = [
     "TRUTH",
     "Compression",
+    "NothingLeftError",
     "Origin",
     "Platform",
     "Recorded",

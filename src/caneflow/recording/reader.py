@@ -4,25 +4,52 @@ import heapq
 import json
 import os
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import Any, BinaryIO, NamedTuple, Self, TypeAlias
 from weakref import WeakValueDictionary
 
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
+from caneflow.messages.rig import Rig, overlaid, read_rig
+from caneflow.printable import printable
+from caneflow.recording.continuity import Continuity
 from caneflow.recording.errors import RecordingError
-from caneflow.recording.layout import DAMAGE, MAGIC, Block, Content, Layout, content_of, layout_of
+from caneflow.recording.layout import (
+    DAMAGE,
+    MAGIC,
+    Block,
+    Content,
+    Layout,
+    TooMuchError,
+    content_of,
+    layout_of,
+)
 from caneflow.recording.platform import Platform
+from caneflow.recording.writer import FORMAT_VERSION
 
 TRUTH = ("truth", "pose")  # node and port of the ground truth, where there is any
+MAX_RIG = 2**20  # characters of JSON
 MAX_RIG_DEPTH = 16
+MAX_HELD = 2**26  # bytes of unpacked blocks in use at a time, one per stream; a payload that is given out adds its own
+COUNTED = (
+    2**16
+)  # bytes of a block that is worth adding up: smaller ones of all streams there can be are as much as that
+MOST_PASSES = 16  # through a file, by streams that lie far apart in time
+GLANCE_BLOCKS = 64  # a minute of a live recording
+GLANCE_BYTES = 2**24  # unpacked: a minute of a cane
+MOST_NAMED = 50  # streams in an error message
 EXPECTED = "a recording is an MCAP file as `caneflow run --record` writes it"
+
+End: TypeAlias = tuple[int, int] | tuple[None, None]  # stamp (ns) and seq
+NEVER: End = (None, None)
 
 # Blocks by file and offset, while somebody reads them: a host in one process has a reader per source of the graph.
 _contents: WeakValueDictionary[tuple[tuple[int, ...], int], Content] = WeakValueDictionary()
@@ -65,6 +92,18 @@ class Recorded(NamedTuple):
             raise RecordingError(f"{self.key}: sample {self.seq}: {error}") from error
 
 
+@dataclass
+class _Effort:
+    """How many blocks may still be unpacked: streams far apart in time each go through all of them by themselves."""
+
+    left: int
+
+    def spend(self) -> bool:
+        """Whether there is one left; it is gone then."""
+        self.left -= 1
+        return self.left >= 0
+
+
 class Recording:
     """A recording, open for reading; several iterations may be under way at a time, in one thread.
 
@@ -87,6 +126,7 @@ class Recording:
             self._layout = _sound_layout(self.path, self._file)
             about = os.fstat(self._file.fileno())
             self._file_id = (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns)
+            self._blocks = _by_topic(self._layout)
             self._lasts: dict[tuple[int, str], int] = {}  # by offset and key: the last stamp, ns
             self.complete = self._layout.complete
             self.metadata, self.rig = _about(self.path, self._layout)
@@ -101,11 +141,18 @@ class Recording:
         """The name of the flow that was recorded."""
         return self.metadata["flow"]
 
+    def validated_rig(self, below: Mapping[str, Any] | None = None) -> Rig:
+        """The rig, laid over `below`; raises RecordingError, naming every value that is not right."""
+        try:
+            return read_rig(overlaid(dict(below or {}), self.rig))
+        except MessageError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+
     def span(self) -> tuple[int, int] | None:
-        """Stamps (ns) of the first and last sample of all streams; None when there is no sample."""
-        first = [stream.first_stamp for stream in self.streams.values() if stream.first_stamp is not None]
-        last = [stream.last_stamp for stream in self.streams.values() if stream.last_stamp is not None]
-        return (min(first), max(last)) if first else None
+        """The smallest and the largest stamp (ns) at the ends of all streams; None when there is no sample."""
+        ends = ((stream.first_stamp, stream.last_stamp) for stream in self.streams.values())
+        stamps = [stamp for pair in ends for stamp in pair if stamp is not None]
+        return (min(stamps), max(stamps)) if stamps else None
 
     def samples(
         self,
@@ -122,14 +169,45 @@ class Recording:
         wanted = [self.stream(*name) for name in (self.streams if streams is None else streams)]
         for stream in wanted:
             self._require_samples(stream)
-        each = [self._samples_of(stream, start_ns, end_ns) for stream in wanted]
+        effort = _Effort(MOST_PASSES * len(self._layout.blocks))
+        each = [self._samples_of(stream, start_ns, end_ns, effort) for stream in wanted]
         if len(each) == 1:
             return each[0]
         return heapq.merge(*each, key=attrgetter("stamp"))  # equal stamps: in the order of the arguments
 
+    def examined(
+        self,
+        streams: Iterable[tuple[str, str]] | None = None,
+        *,
+        end_ns: int | None = None,
+        glance: bool = False,
+    ) -> dict[tuple[str, str], Continuity]:
+        """How the samples of each of `streams` (None: all) follow each other, up to a first stamp >= `end_ns`.
+
+        `glance`: only a few blocks of a long file are looked at, spread evenly over it.
+        """
+        found = {name: Continuity(self.stream(*name).key) for name in (self.streams if streams is None else streams)}
+        left = {each.key: each for each in found.values()}
+        for block in self._spread() if glance else self._layout.blocks:
+            content = None
+            for key in block.topics & left.keys():
+                content = content or self._content(block)
+                for stamp, seq, _, begin, finish in content.messages[key]:
+                    if end_ns is not None and stamp >= end_ns:
+                        del left[key]
+                        break
+                    left[key].take(seq, stamp, content.data[begin:finish])
+        return found
+
+    def _spread(self) -> list[Block]:
+        """So many blocks, evenly spread, that looking at them takes a moment, however long the file is."""
+        blocks = self._layout.blocks
+        unpacked = sum(block.unpacked for block in blocks)
+        return blocks[:: max(1, -(-len(blocks) // GLANCE_BLOCKS), -(-unpacked // GLANCE_BYTES))]
+
     def said(self, key: str) -> Iterator[bytes]:
         """The payloads of a control key such as `cane/@/late`, in the order of the file."""
-        for block in self._blocks(key):
+        for block in self._blocks.get(key, []):
             content = self._content(block)
             for *_, begin, finish in content.messages[key]:
                 yield content.data[begin:finish]
@@ -139,8 +217,13 @@ class Recording:
         try:
             return self.streams[node, port]
         except KeyError:
-            there = ", ".join("/".join(name) for name in self.streams) or "none"
-            raise RecordingError(f"{self.path}: no stream {node}/{port}; there are {there}") from None
+            raise RecordingError(f"{self.path}: no stream {node}/{port}; there are {self.named()}") from None
+
+    def named(self) -> str:
+        """The names of the streams, for a line; of very many only the first."""
+        names = ["/".join(name) for name in self.streams]
+        more = [f"and {len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else []
+        return ", ".join([*names[:MOST_NAMED], *more]) or "none"
 
     def streams_of(self, kind: type[Sample]) -> list[Stream]:
         """The streams with samples of `kind`, ground truth aside."""
@@ -158,14 +241,13 @@ class Recording:
     ) -> None:
         self.close()
 
-    def _samples_of(self, stream: Stream, start: int | None, end: int | None) -> Iterator[Recorded]:
+    def _samples_of(self, stream: Stream, start: int | None, end: int | None, effort: "_Effort") -> Iterator[Recorded]:
         """The samples of one stream. Holds one block at a time, which is what bounds the memory."""
         key, node, port, kind = stream.key, stream.node, stream.port, SAMPLES.get(stream.schema)
-        blocks = self._blocks(key)
-        if start is not None:
-            del blocks[: bisect_left(blocks, start, key=lambda block: self._last(block, key))]
-        for block in blocks:
-            content = self._content(block)
+        blocks = self._blocks.get(key, [])
+        first = 0 if start is None else bisect_left(blocks, start, key=lambda block: self._last(block, key))
+        for block in islice(blocks, first, None):
+            content = self._content(block, effort)
             for stamp, seq, log_time, begin, finish in content.messages[key]:
                 if start is not None and stamp < start:
                     continue
@@ -173,24 +255,34 @@ class Recording:
                     return
                 yield Recorded(key, node, port, kind, stamp, seq, log_time, content.data[begin:finish])
 
-    def _blocks(self, key: str) -> list[Block]:
-        return [block for block in self._layout.blocks if key in block.topics]
-
-    def _content(self, block: Block) -> Content:
+    def _content(self, block: Block, effort: "_Effort | None" = None) -> Content:
         """The messages of `block`, unpacked once for all that are in it at a time."""
         at = self._file_id, block.offset
         content = _contents.get(at)
         if content is None:
+            if effort is not None and not effort.spend():
+                raise RecordingError(
+                    f"{self.path}: its streams lie too far apart in time to be read together; read them one by one"
+                )
             try:
                 content = content_of(self._file, block, self._layout.declared)
+            except TooMuchError as error:
+                raise RecordingError(f"{self.path}: {error}") from error
             except DAMAGE as error:
                 raise RecordingError(_damaged(self.path, block.offset)) from error
+            held = sum(each.memory for each in _contents.values()) if content.memory > COUNTED else 0
+            if held and held + content.memory > MAX_HELD:
+                raise RecordingError(
+                    f"{self.path}: its streams lie so far apart in the file that more than {MAX_HELD >> 20} MiB of it "
+                    "would be in use at a time; a recording has them side by side"
+                )
             _contents[at] = content
         return content
 
     def _streams(self) -> tuple[dict[tuple[str, str], Stream], dict[str, int]]:
         streams: dict[tuple[str, str], Stream] = {}
         others: dict[str, int] = {}
+        firsts, lasts = self._ends()
         for key, channel in self._topics().items():
             try:
                 node, port = stream_of(key)
@@ -201,7 +293,7 @@ class Recording:
                 raise RecordingError(
                     f"{self.path}: both {streams[node, port].key} and {key} are in it; a recording is of one flow"
                 )
-            (first, first_seq), (last, last_seq) = self._ends(key)
+            (first, first_seq), (last, last_seq) = firsts.get(key, NEVER), lasts.get(key, NEVER)
             streams[node, port] = Stream(
                 key=key,
                 node=node,
@@ -222,13 +314,16 @@ class Recording:
             topics.setdefault(channel.topic, channel)
         return topics
 
-    def _ends(self, key: str) -> tuple[tuple[int, int] | tuple[None, None], tuple[int, int] | tuple[None, None]]:
-        """Stamp and seq of the first and the last sample, found without reading what lies between."""
-        blocks = self._blocks(key)
-        if not blocks:
-            return (None, None), (None, None)
-        first, last = self._content(blocks[0]).messages[key][0], self._content(blocks[-1]).messages[key][-1]
-        return first[:2], last[:2]
+    def _ends(self) -> tuple[dict[str, End], dict[str, End]]:
+        """Stamp and seq of each topic's first and last sample, found without reading what lies between."""
+        edges = {block.offset: block for blocks in self._blocks.values() for block in (blocks[0], blocks[-1])}
+        firsts: dict[str, End] = {}
+        lasts: dict[str, End] = {}
+        for _, block in sorted(edges.items()):  # each is unpacked once, for all streams that begin or end there
+            for key, entries in self._content(block).messages.items():
+                firsts.setdefault(key, entries[0][:2])
+                lasts[key] = entries[-1][:2]
+        return firsts, lasts
 
     def _last(self, block: Block, key: str) -> int:
         """Stamp of the last sample of `key` in `block`, which is kept: a search looks at few blocks many times."""
@@ -257,10 +352,21 @@ class Recording:
 
 def _sound_layout(path: Path, file: BinaryIO) -> Layout:
     require_mcap(path, file)
-    layout = layout_of(file)
+    try:
+        layout = layout_of(file)
+    except TooMuchError as error:
+        raise RecordingError(f"{path}: {error}") from error
     if layout.damaged:
         raise RecordingError(_damaged(path, layout.damaged[0]))
     return layout
+
+
+def _by_topic(layout: Layout) -> dict[str, list[Block]]:
+    blocks: defaultdict[str, list[Block]] = defaultdict(list)
+    for block in layout.blocks:
+        for topic in block.topics:
+            blocks[topic].append(block)
+    return dict(blocks)
 
 
 def require_mcap(path: Path, file: BinaryIO) -> None:
@@ -281,10 +387,19 @@ def _about(path: Path, layout: Layout) -> tuple[dict[str, str], dict[str, Any]]:
         if key not in layout.metadata.get(name, {}):
             cut = "" if layout.complete else ", it was cut before there was any"
             raise RecordingError(f"{path}: has no metadata record {name!r} with {key!r}{cut}; {EXPECTED}")
-    return layout.metadata["caneflow"], _rig_in(path, layout.metadata["rig"]["json"])
+    about = {key: printable(value) for key, value in layout.metadata["caneflow"].items()}
+    version = about.get("version", "")
+    if version.isdecimal() and version != FORMAT_VERSION:
+        raise RecordingError(
+            f"{path}: has version {version[:9]} of the layout; this version of caneflow reads version {FORMAT_VERSION}"
+        )
+    return about, rig_in(path, layout.metadata["rig"]["json"])
 
 
-def _rig_in(path: Path, text: str) -> dict[str, Any]:
+def rig_in(path: Path, text: str) -> dict[str, Any]:
+    """The rig in the JSON `text`; raises RecordingError when there is none."""
+    if len(text) > MAX_RIG:
+        raise RecordingError(f"{path}: the rig in it has {len(text)} characters; at most {MAX_RIG} are read")
     try:
         rig = json.loads(text)
         json.dumps(rig, ensure_ascii=False).encode()  # half a surrogate pair is no text

@@ -3,6 +3,7 @@
 import hashlib
 import math
 import uuid
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 import msgspec
 
 import caneflow
-from caneflow.messages import Sample, control_key, decode, sample_key
+from caneflow.messages import MessageError, Sample, control_key, decode, sample_key
 from caneflow.messages.control import LeftOut
 from caneflow.messages.rig import overlaid, read_rig
 from caneflow.recording import Recording
@@ -138,8 +139,9 @@ def deploy(
                 else _replayed(graph, node, nodes, replay, recording, origin)
                 for name, node in nodes.items()
             }
+            _require_stamps(recording, replay, origin, plans)
     whole_rig = overlaid(base_rig, rig or {})
-    read_rig(whole_rig)  # what is wrong with a recording's rig is said before anything starts
+    _require_rig(whole_rig, replay)  # what is wrong with a recording's rig is said before anything starts
     site = None if machine is None else _site(graph, machine, nodes)
     if record is not None:
         name = recorder_name(machine if site else None)
@@ -286,9 +288,8 @@ def _replayed(
                 for reader in nodes.values()
                 for wire in reader.inputs.values()
             ):
-                held = ", ".join(f"{n}/{p}" for n, p in recording.streams) or "none"
                 raise DataflowError(
-                    f"{replay.recording}: no stream {node.name}/{port}; it holds {held} "
+                    f"{replay.recording}: no stream {node.name}/{port}; it holds {recording.named()} "
                     f"(--without {node.name} leaves the node out)"
                 )
         elif stream.schema != kind.schema:
@@ -318,19 +319,41 @@ def _replayed(
 def _left_out(graph: Graph, recording: Recording) -> LeftOutStamps:
     """What the nodes of a recorded live run said that they did not handle: by node and port, the stamps (ns)."""
     stamps: LeftOutStamps = {}
+    lost: dict[tuple[str, str], list[tuple[int, int]]] = {}  # by node and port the numbers, first and last
     for payload in recording.said(control_key(recording.flow, "late")):
-        note = decode(payload, LeftOut)
+        try:
+            note = decode(payload, LeftOut)
+        except MessageError as error:
+            raise DataflowError(f"{recording.path}: what it says was left out cannot be read: {error}") from error
         reader = graph.nodes.get(note.node)
-        wire = reader.inputs.get(note.port) if reader else None
-        if wire is None:
+        if reader is None or note.port not in reader.inputs:
             continue  # another graph than the recorded one: what it leaves out is its own affair
-        found = stamps.setdefault((note.node, note.port), set())
         if note.stamp >= 0:
-            found.add(note.stamp)
-        elif (wire.node, wire.port) in recording.streams:  # never came there, but did come to the recorder
-            lost = range(note.first_seq, note.last_seq + 1)
-            found.update(s.stamp for s in recording.samples([(wire.node, wire.port)]) if s.seq in lost)
+            stamps.setdefault((note.node, note.port), set()).add(note.stamp)
+        else:
+            lost.setdefault((note.node, note.port), []).append((note.first_seq, note.last_seq))
+    for (node, port), ranges in lost.items():
+        wire = graph.nodes[node].inputs[port]
+        if (wire.node, wire.port) in recording.streams:  # never came there, but did come to the recorder
+            numbers = _Numbers(ranges)
+            samples = recording.samples([(wire.node, wire.port)])
+            stamps.setdefault((node, port), set()).update(s.stamp for s in samples if s.seq in numbers)
     return stamps
+
+
+class _Numbers:
+    """Ranges of numbers, given by their first and last: many, so that looking through all for each sample is no way."""
+
+    def __init__(self, ranges: Iterable[tuple[int, int]]) -> None:
+        self._firsts: list[int] = []
+        self._lasts: list[int] = []  # the largest so far
+        for first, last in sorted(ranges):
+            self._firsts.append(first)
+            self._lasts.append(max([last, *self._lasts[-1:]]))
+
+    def __contains__(self, number: int) -> bool:
+        before = bisect_right(self._firsts, number)
+        return before > 0 and number <= self._lasts[before - 1]
 
 
 def _span(recording: Recording) -> tuple[int, int]:
@@ -348,6 +371,29 @@ def _origin(recording: Recording, replay: Replay) -> int:
             f"{replay.recording}: --start {replay.start_s:g} s lies beyond its end at {(last - first) / 1e9:.3f} s"
         )
     return first + round(replay.start_s * 1e9)
+
+
+def _require_stamps(recording: Recording, replay: Replay, origin: int, plans: Mapping[str, NodePlan]) -> None:
+    """Raise DataflowError for a stream whose stamps go back or are not its samples', up to the end of the replay.
+
+    Before anything starts: half of such a stream would be refused on its way.
+    """
+    end = None if replay.duration_s is None else origin + round(replay.duration_s * 1e9)
+    replayed = [(name, port) for name, plan in plans.items() if plan.module == REPLAYER_MODULE for port in plan.outputs]
+    found = recording.examined(replayed, end_ns=end)
+    for each in found.values():
+        if each.fault:
+            raise DataflowError(f"{replay.recording}: {each.fault}")
+
+
+def _require_rig(rig: dict[str, Any], replay: Replay | None) -> None:
+    """Raise an error that names the recording where there is one: most of a replay's rig is from there."""
+    try:
+        read_rig(rig)
+    except MessageError as error:
+        if replay is None:
+            raise
+        raise DataflowError(f"{replay.recording}, or what is laid over its rig: {error}") from error
 
 
 def _loop_s(recording: Recording, replay: Replay, origin: int) -> float:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from caneflow.errors import CaneflowError
+from caneflow.printable import printable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +30,7 @@ class Problem:
 
     def __str__(self) -> str:
         parts = [str(self.place), "warning" if self.warning else "", self.path, self.text]
-        text = ": ".join(part for part in parts if part)
-        return text.encode(errors="backslashreplace").decode()  # names from outside may be no text
+        return printable(": ".join(part for part in parts if part))
 
 
 class DataflowError(CaneflowError):

@@ -10,7 +10,6 @@ from typing import Any
 
 from caneflow.algorithms.rotations import Vector
 from caneflow.messages import Pose, RadarFrame
-from caneflow.messages.rig import read_rig
 from caneflow.recording import TRUTH, Recorded, Recording, RecordingError, Stream
 from caneflow.viewing import packets
 from caneflow.viewing.columns import COLUMNS, Row, packed, row_of
@@ -34,7 +33,7 @@ class RecordedStreams:
             if span is None:
                 raise RecordingError(f"{path}: holds no sample; there is nothing to see")
             self._flow = recording.flow
-            self._rig = read_rig(recording.rig)
+            self._rig = recording.validated_rig()
             self._streams = dict(recording.streams)
             self._origin, self._end = span
         self._ready: list[bytes] = []  # packets

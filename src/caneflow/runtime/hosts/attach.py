@@ -14,6 +14,7 @@ import zenoh
 from caneflow.errors import CaneflowError
 from caneflow.messages import control_key, sample_key
 from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
+from caneflow.printable import printable
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links import open_session, sent_at
 from caneflow.runtime.hosts.run_directory import RunningFlow, refused_addresses, running_flows
@@ -79,7 +80,7 @@ class Attached:
 
         def on_sample(sample: zenoh.Sample) -> None:
             schema = str(sample.encoding).rpartition(";")[2]
-            put(Heard(str(sample.key_expr), schema, sample.payload.to_bytes(), sent_at(sample)))
+            put(Heard(printable(str(sample.key_expr)), printable(schema), sample.payload.to_bytes(), sent_at(sample)))
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         held = [self.session.declare_subscriber(sample_key(self.flow, *stream), handler) for stream in streams]
@@ -160,7 +161,8 @@ def timed_statuses(session: zenoh.Session, flow: str) -> list[tuple[FlowStatus, 
             continue
         try:
             # Not by the codec of samples, which needs numpy: a status has to be there at once.
-            status = msgspec.msgpack.decode(reply.ok.payload.to_bytes(), type=FlowStatus)
+            said = _visible(msgspec.msgpack.decode(reply.ok.payload.to_bytes()))
+            status = msgspec.convert(said, FlowStatus)
         except msgspec.DecodeError as error:
             raise DataflowError(
                 f"a launcher answers in another way ({error}); is it of another version of caneflow?"
@@ -168,6 +170,18 @@ def timed_statuses(session: zenoh.Session, flow: str) -> list[tuple[FlowStatus, 
         ahead = (status.clock - (asked + arrived) / 2) / 1e9
         answers.append((status, (ahead, (arrived - asked) / 2e9)))
     return answers
+
+
+def _visible(said: Any) -> Any:
+    """What a peer said, with every text in it as a terminal can show it."""
+    match said:
+        case str():
+            return printable(said)
+        case dict():
+            return {_visible(key): _visible(value) for key, value in said.items()}
+        case list():
+            return [_visible(each) for each in said]
+    return said
 
 
 def merged(answers: Sequence[FlowStatus]) -> FlowStatus:

@@ -675,3 +675,9 @@ def note_losses(outcome: Outcome) -> None:
             for what in ("lost", "late", "dropped"):
                 if number := getattr(counts, what):
                     outcome.failures.append(f"{name}.{port}: {number} samples {what}; the result is incomplete")
+            if 2 * counts.refused > counts.received:
+                refused = f"{counts.refused} of {counts.received} samples refused"
+                outcome.failures.append(f"{name}.{port}: {refused}; more than half of the recording is lost")
+        for port, number in counters.unsent.items():
+            if number > counters.outputs.get(port, 0):
+                outcome.failures.append(f"{name}/{port}: {number} samples not sent; more than half is lost")

@@ -20,7 +20,6 @@ from caneflow.algorithms.rotations import Vector
 from caneflow.algorithms.track_errors import Floats, Track, TrackErrors, final_offset, track_errors
 from caneflow.errors import CaneflowError
 from caneflow.messages import Pose, Sample
-from caneflow.messages.rig import Rig, overlaid
 from caneflow.recording import TRUTH, Recording
 from caneflow.runtime.dataflow.graph import Graph, Node, Queue, Wire
 from caneflow.runtime.dataflow.loading import load
@@ -166,7 +165,7 @@ def _evaluate(
 def _known_of(graph: Graph, path: Path) -> tuple[Track | None, Vector]:
     """A recording's truth, where there is any, and the boresight."""
     with Recording(path) as recording:
-        rig = Rig.model_validate(overlaid(graph.rig, recording.rig))
+        rig = recording.validated_rig(below=graph.rig)
         if TRUTH not in recording.streams:
             return None, rig.boresight
         poses = [sample.decoded() for sample in recording.samples([TRUTH])]

@@ -88,8 +88,9 @@ def verify(graph: Graph, path: Path, *, tolerance: float | None = None) -> Verif
             if plan.inputs and (name, port) in recording.streams
         }
         if not outputs:
-            held = ", ".join(f"{node}/{port}" for node, port in recording.streams)
-            raise DataflowError(f"{path}: holds no output of {graph.path} ({held}); record a run with --record")
+            raise DataflowError(
+                f"{path}: holds no output of {graph.path} ({recording.named()}); record a run with --record"
+            )
         differences = recording.platform.differences(Platform.here()) if recording.platform else []
         if tolerance is None:
             tolerance = ACROSS_PLATFORMS if differences else 0.0
@@ -113,7 +114,7 @@ class _Comparison:
     def __init__(self, recording: Recording, streams: list[tuple[str, str]], tolerance: float) -> None:
         self._tolerance = tolerance
         # A live run is cut off where it was ended: its inputs may be recorded a little further than its outputs.
-        self._open_ended = recording.metadata["source"] == "live" or not recording.complete
+        self._open_ended = recording.metadata.get("source") == "live" or not recording.complete
         self._recorded: dict[str, Iterator[Recorded]] = {}
         self._verdicts: dict[str, Verdict] = {}
         for node, port in streams:
