@@ -229,33 +229,30 @@ def test_between_the_samples_of_a_replay_all_else_is_done(made: Any) -> None:
     assert [progress.handled for progress in bus.told] == [10_000_000, 20_000_000]
 
 
-def test_in_a_replay_a_mark_that_overtook_its_samples_asks_for_none_of_them(made: Any, clock: Clock) -> None:
-    host, bus, _ = made(replay=True)
-    host.take(Answered("imu", 0, PortMark(-1, -1)))
-    host.take(Marked("imu", PortMark(99, 10**12)))
-    for seq in range(100):
-        clock.now += 0.9 * node.MARKS_AHEAD
-        host.ask_for_missing()
-        assert host.take_at_once(arrival(seq))
-    assert bus.asked == []
-
-
 def test_in_a_replay_what_does_not_come_is_asked_for_and_waited_for(made: Any, clock: Clock) -> None:
     host, bus, _ = made(replay=True)
     host.take(Answered("imu", 0, PortMark(-1, -1)))
     host.take_at_once(arrival(0))
     host.take(Marked("imu", PortMark(2, 10**12)))
     host.ask_for_missing()
-    assert bus.asked == []
-    clock.now += 1.01 * node.MARKS_AHEAD
-    host.ask_for_missing()
     assert bus.asked == [1]
     clock.now += 0.9 * node.REPLAY_PATIENCE
     host.ask_for_missing()
     assert host.stage.inputs["imu"].counts.lost == 0
-    clock.now += 0.1 * node.REPLAY_PATIENCE
+    clock.now += 0.11 * node.REPLAY_PATIENCE
     host.ask_for_missing()
     assert host.stage.inputs["imu"].counts.lost == 2
+
+
+def test_what_is_asked_for_already_is_not_asked_for_twice(made: Any, clock: Clock) -> None:
+    host, bus, _ = made(replay=True)
+    host.ask_for_missing()
+    host.take_at_once(arrival(7))
+    assert bus.asked == [0], "a node that is new asks for what it may have missed: that is the same"
+    clock.now += 1.01 * node.ASK_PERIOD
+    host.ask_for_missing()
+    assert set(bus.asked) == {0}, "there was no answer"
+    assert len(bus.asked) > 1
 
 
 def test_a_gap_in_the_numbers_is_asked_for_at_once(made: Any) -> None:
@@ -264,6 +261,26 @@ def test_a_gap_in_the_numbers_is_asked_for_at_once(made: Any) -> None:
     host.take_at_once(arrival(0))
     host.take_at_once(arrival(2))
     assert bus.asked == [1]
+
+
+def test_live_a_writer_that_is_silent_is_waited_for_longer_than_one_that_goes_on(made: Any, clock: Clock) -> None:
+    """A busy one answers when it is done; one that sends more and does not answer will not."""
+    for goes_on in (False, True):
+        host, _, _ = made()
+        counts = host.stage.inputs["imu"].counts
+        host.take_at_once(arrival(0))
+        host.take_at_once(arrival(2))
+        clock.now += 0.5 * node.LIVE_PATIENCE
+        if goes_on:
+            host.take_at_once(arrival(3))
+        clock.now += 0.6 * node.LIVE_PATIENCE
+        host.ask_for_missing()
+        assert counts.lost == (1 if goes_on else 0)
+        clock.now += node.SILENT_PATIENCE
+        host.ask_for_missing()
+        assert counts.lost == 1
+        host.handle_what_is_due()
+        assert counts.handled == (3 if goes_on else 2), "what came after it is handled"
 
 
 def test_after_its_end_a_node_takes_no_more(made: Any) -> None:

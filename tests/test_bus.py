@@ -7,8 +7,9 @@ from contextlib import contextmanager
 import pytest
 import zenoh
 
-from caneflow.messages import control_key
-from caneflow.runtime.hosts.bus import Arrived, Bus, Event, Started
+from caneflow.messages import control_key, encode
+from caneflow.messages.control import Again, PortMark, Progress
+from caneflow.runtime.hosts.bus import AGAIN, Arrived, Bus, Event, Started
 from caneflow.runtime.hosts.links import Ports, open_session
 from caneflow.runtime.plan import InputPlan, Links, NodePlan
 from tests.flows import wait_for
@@ -58,6 +59,42 @@ def test_what_has_come_in_a_replay_is_taken_before_the_end() -> None:
         free.set()
         bus.hear_out()
     assert taken == list(range(SAMPLES))
+
+
+def test_in_a_replay_no_mark_or_answer_overtakes_the_samples_that_were_sent_before_it() -> None:
+    """Or they would be asked for while they are on their way, and come twice."""
+    free = threading.Event()
+    came: list[str] = []
+
+    def take(event: Event) -> bool:
+        free.wait(30)
+        again = isinstance(event, Arrived) and event.again
+        came.append(type(event).__name__ + ("Again" if again else ""))
+        return True
+
+    with met(replay=True) as (bus, writer):
+        bus.at_once = take
+        history, progress = control_key("f", "history", "imu", "imu"), control_key("f", "progress", "imu")
+        answered = threading.Event()
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                query.reply(history, b"0")
+                end = encode(Again(0, PortMark(2, 30)))
+                query.reply(history, end, encoding=zenoh.Encoding("application/msgpack").with_schema(AGAIN))
+            answered.set()
+
+        writer.declare_queryable(history, zenoh.handlers.Callback(answer, indirect=False))
+        say(writer, 2)
+        mark = encode(Progress("imu", 20, {"imu": PortMark(1, 20)}))
+        writer.put(progress, mark, congestion_control=zenoh.CongestionControl.BLOCK)
+        bus.ask_again("imu", 0)
+        assert answered.wait(30)
+        say(writer, 1)
+        assert came == []
+        free.set()
+        wait_for(lambda: len(came) == 6, "everything to be taken")
+    assert came == ["Arrived", "Arrived", "Marked", "ArrivedAgain", "Answered", "Arrived"]
 
 
 @pytest.mark.parametrize("replay", [False, True])

@@ -11,7 +11,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +42,7 @@ from caneflow.runtime.hosts.bus import (
 from caneflow.runtime.hosts.last_words import telling_failures
 from caneflow.runtime.hosts.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
-from caneflow.runtime.program import Context, Operator, Program, Quiet, Sink, Source
+from caneflow.runtime.program import Context, Encoded, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.stages.feed import Feed
 from caneflow.runtime.stages.history import History
 from caneflow.runtime.stages.merge import BEGIN, END
@@ -62,8 +62,8 @@ LOOKS_PER_LAG = 5  # and so often within the time that it may wait for an input
 COUNTERS_PERIOD = 1.0  # s
 SAY_AGAIN_PERIOD = 1.0  # s after which a progress mark is said again: the last one may have met a broken link
 ASK_PERIOD = 0.3  # s between two requests for samples that have not come
-MARKS_AHEAD = 0.1  # s, in a replay: that samples may be underway which a progress mark has overtaken
-LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run
+LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run, while their writer sends and does not answer
+SILENT_PATIENCE = 10.0  # s, likewise, while it does neither: it may be busy, and nothing else comes that has to wait
 REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
 SNAPSHOT_PERIOD = 0.5  # s between two snapshots of an operator
 LIVE_SNAPSHOT_PERIOD = 2.0  # s, live: each is work, and wear of the disk; to catch up on so little is soon done
@@ -150,6 +150,7 @@ class _Missing:
     """Samples that were sent and have not come."""
 
     expected: int  # seq of the first of them
+    newest: int  # seq that the writer had sent then
     since: float  # s, monotonic
     ask_at: float  # s, monotonic
 
@@ -331,10 +332,11 @@ class _ReaderNode(ABC):
                 continue
             missing = self._missing.get(port)
             if missing is None or missing.expected != arrivals.expected:
-                # In a replay a mark overtakes the samples that it speaks of.
-                ask_at = now + MARKS_AHEAD if self.plan.replay and not arrivals.ahead else now
-                missing = self._missing[port] = _Missing(arrivals.expected, since=now, ask_at=ask_at)
-            if now - missing.since > (REPLAY_PATIENCE if self.plan.replay else LIVE_PATIENCE):
+                # Nothing overtakes on a link, nor in the bus: what is missing here is not on its way.
+                ask_at = self._unanswered.get(port, now)  # it may have been asked for
+                missing = _Missing(arrivals.expected, arrivals.newest, since=now, ask_at=ask_at)
+                self._missing[port] = missing
+            if now - missing.since > self._patience(arrivals.newest > missing.newest):
                 self.skip_to(port, before)
             elif now >= missing.ask_at:
                 self.bus.ask_again(port, arrivals.expected)
@@ -342,6 +344,12 @@ class _ReaderNode(ABC):
 
     def begin_at(self, port: str, seq: int) -> None:  # noqa: B027 - an operator goes on from its snapshot
         """Hear that the writer has no sample before `seq` any more."""
+
+    def _patience(self, goes_on: bool) -> float:
+        """How long (s) later samples wait for missing ones; `goes_on`: their writer sends more and does not answer."""
+        if self.plan.replay:
+            return REPLAY_PATIENCE
+        return LIVE_PATIENCE if goes_on else SILENT_PATIENCE
 
     @abstractmethod
     def skip_to(self, port: str, seq: int) -> None:
@@ -634,6 +642,8 @@ class _Ended(BaseException):
 
 
 class _SourceNode:
+    """A source on the main thread, where it may block in a read of its device; what comes is taken on a second one."""
+
     def __init__(self, plan: NodePlan, bus: Bus, source: Source) -> None:
         self.plan = plan
         self.bus = bus
@@ -641,8 +651,10 @@ class _SourceNode:
         self.feed = Feed(plan.node, plan.outputs, ordered=source.ordered)
         self.history = History({port: out.readers for port, out in plan.outputs.items()})
         self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else LIVE_REPORT_PERIOD)
+        self.lock = threading.Condition()  # over all of this node's state; told when something has come
         self.started = False
         self.stopped = False
+        self.broken: BaseException | None = None  # raised on the second thread
         self.until = BEGIN if plan.replay else END  # how far a replay may send
 
     def at(self) -> str | None:
@@ -652,16 +664,25 @@ class _SourceNode:
         return ", ".join(f"{port} seq {out.sent - 1}" for port, out in self.feed.outputs.items())
 
     def run(self) -> None:
+        threading.Thread(target=self.take_all_events, name="requests", daemon=True).start()
         try:
             with self.ended_by_sigterm():
                 self.bus.declare_ready()
-                while not (self.started or self.stopped):
-                    self.take_events(timeout=None)
+                self.wait_for(lambda: self.started)
                 self.send_all()
                 self.end()
         except _Ended:
             pass
+        finally:
+            self.stopped = True
+        if self.broken is not None:
+            raise self.broken
         self.count(at_once=True)
+
+    def wait_for(self, condition: Callable[[], bool], timeout: float | None = None) -> None:
+        """Wait until what has come fulfils the condition, or the source is to end, or for `timeout` s."""
+        with self.lock:
+            self.lock.wait_for(lambda: self.stopped or condition(), timeout)
 
     def send_all(self) -> None:
         samples = self.source.samples()
@@ -670,32 +691,61 @@ class _SourceNode:
                 if self.stopped:
                     return
                 if isinstance(item, Quiet):
-                    self.feed.nothing_until(item.until)
-                    self.reports.progress(self.feed.progress())
+                    self.report(item.until)
                     continue
                 port, sample = item
                 self.wait_for_window(sample.stamp)
-                payload = self.feed.take(port, sample)
-                if payload is not None:
-                    self.history.keep(port, self.feed.outputs[port].sent - 1, payload)
-                    self.bus.send(port, payload)
+                self.send(port, sample)
                 if self.reports.due():
-                    self.reports.progress(self.feed.progress())
+                    self.report()
                     self.count()
         finally:
             samples.close()
 
+    def send(self, port: str, sample: Sample | Encoded) -> None:
+        with self.lock:
+            payload = self.feed.take(port, sample)
+            seq = self.feed.outputs[port].sent - 1
+        if payload is not None:
+            # First sent, then kept: what is sent again on request never arrives before the sample itself. And without
+            # the lock: requests do not wait for a link.
+            self.bus.send(port, payload)
+            with self.lock:
+                self.history.keep(port, seq, payload)
+
+    def report(self, nothing_until: int = BEGIN) -> None:
+        """Say how far the source has come; no sample up to the stamp `nothing_until` (ns) will follow."""
+        with self.lock:
+            self.feed.nothing_until(nothing_until)
+            progress = self.feed.progress()
+        self.reports.progress(progress)
+
     def wait_for_window(self, stamp: int) -> None:
         """Hold a replay's sample back until the readers have come near enough."""
-        if self.bus.pending():
-            self.take_events(timeout=0)
         while stamp > self.until and not self.stopped:
-            self.feed.nothing_until(stamp - 1)
-            self.reports.progress(self.feed.progress())
-            self.take_events(timeout=SAY_AGAIN_PERIOD)
+            self.report(stamp - 1)
+            self.wait_for(lambda: stamp <= self.until, SAY_AGAIN_PERIOD)
 
-    def take_events(self, timeout: float | None) -> None:
-        for event in self.bus.events(timeout):
+    def take_all_events(self) -> None:
+        """Take what comes, however long the source is silent: a restarted reader asks for what it missed."""
+        try:
+            while not self.stopped:
+                for event in self.bus.events(timeout=None):
+                    self.take(event)
+        except BaseException as error:
+            if not self.stopped:  # else the session is closing
+                self.broken = error
+                main = threading.main_thread().ident or 0
+                signal.pthread_kill(main, signal.SIGTERM)  # it raises the error, and may be blocked in a read
+
+    def take(self, event: Event) -> None:
+        if isinstance(event, Asked):
+            with self.lock:
+                end = Again(self.history.first(event.port), self.feed.progress().ports[event.port])
+                payloads = self.history.since(event.port, event.first)
+            self.bus.answer(event, payloads, end)
+            return
+        with self.lock:
             match event:
                 case Started():
                     self.started = True
@@ -703,20 +753,18 @@ class _SourceNode:
                     self.until = max(self.until, event.until)
                 case Confirmed():
                     self.history.confirm(event.port, event.reader, event.seq)
-                case Asked():
-                    end = Again(self.history.first(event.port), self.feed.progress().ports[event.port])
-                    self.bus.answer(event, self.history.since(event.port, event.first), end)
                 case _:
                     pass  # a source has no inputs
+            self.lock.notify_all()
 
     def end(self) -> None:
         """Say that nothing more will come, and stay until the launcher ends the flow."""
         self.feed.ended = True
         self.count(at_once=True)
         while not self.stopped:
-            self.reports.progress(self.feed.progress())
+            self.report()
             self.count()
-            self.take_events(timeout=SAY_AGAIN_PERIOD)
+            self.wait_for(lambda: False, SAY_AGAIN_PERIOD)
 
     @contextmanager
     def ended_by_sigterm(self) -> Iterator[None]:

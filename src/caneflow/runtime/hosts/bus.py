@@ -31,7 +31,6 @@ ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
 TIMED_PERIOD = 0.047  # s between two in a live run; odd as well
 ENCODINGS_KEPT = 8
-QUEUE = 1_000_000  # samples of a stream that may wait in a replay: more than its window lets come
 HEARING_OUT = 1.0  # s, at most, for what has come when a node is to end
 POLL = 0.01  # s between two looks at a condition that Zenoh does not signal
 
@@ -123,6 +122,30 @@ Event: TypeAlias = (
 )
 
 
+class _Lane:
+    """In a replay, all that comes for one input port, in order, on a thread of its own, which may block.
+
+    Zenoh's receiving thread never waits for it: two nodes that wait for each other's would wait for ever. And a mark or
+    an answer never overtakes the samples that its writer sent before it: they would seem missing.
+    """
+
+    def __init__(self, name: str, bring: Callable[[Event], None]) -> None:
+        self._queue: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
+        self.put = self._queue.put
+        self._bring = bring
+        self._thread = threading.Thread(target=self._bring_all, name=name, daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Bring what has come, and no more."""
+        self._queue.put(None)
+        self._thread.join(HEARING_OUT)
+
+    def _bring_all(self) -> None:
+        while (event := self._queue.get()) is not None:
+            self._bring(event)
+
+
 class Bus:
     """A node's session; a context manager, since a session that is not closed hangs its process."""
 
@@ -139,7 +162,8 @@ class Bus:
         )
         # Whatever must outlive its statement: a liveliness token that no variable holds is undeclared at once.
         self._held: list[Held] = []
-        self._aside: list[tuple[zenoh.Subscriber[Any], threading.Thread]] = []
+        self._subscribers: list[zenoh.Subscriber[Any]] = []  # of samples in a replay
+        self._lanes: dict[str, _Lane] = {}  # by input port, in a replay
         self._listen()
         self._publishers = {port: self._publisher(out.key, out.schema) for port, out in plan.outputs.items()}
         self._progress = self._control_publisher("progress", plan.node)
@@ -171,11 +195,11 @@ class Bus:
 
     def hear_out(self) -> None:
         """End the threads that samples come on, once they have brought what has come."""
-        for subscriber, _ in self._aside:
+        for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
-        for _, thread in self._aside:
-            thread.join(HEARING_OUT)
-        self._aside.clear()
+        for lane in self._lanes.values():
+            lane.end()
+        self._subscribers.clear()
 
     def put(self, event: Event) -> None:
         """Add an event of this process's own; safe in a signal handler."""
@@ -263,8 +287,12 @@ class Bus:
         plan = self._plan
         by_writer: dict[str, dict[str, str]] = {}  # writer -> its port -> this node's port
         for port, wire in plan.inputs.items():
-            subscribe = self._subscribe_aside if plan.replay else self._subscribe
-            subscribe(wire.key, self._on_sample(port))
+            if plan.replay:
+                self._lanes[port] = _Lane(wire.key, self._bring)
+                handler = zenoh.handlers.Callback(self._on_sample(port), indirect=False)
+                self._subscribers.append(self._session.declare_subscriber(wire.key, handler))
+            else:
+                self._subscribe(wire.key, self._on_sample(port))
             by_writer.setdefault(wire.writer, {})[wire.key.rpartition("/")[2]] = port
         for writer, ports in by_writer.items():
             # Whoever has no readers keeps nobody waiting.
@@ -291,19 +319,6 @@ class Bus:
         # Straight on Zenoh's receiving thread: a put into the inbox does not hold it up, nor does a node that is quick.
         handler = zenoh.handlers.Callback(callback, indirect=False)
         self._held.append(self._session.declare_subscriber(key, handler))
-
-    def _subscribe_aside(self, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
-        # On a thread of its own, which may block, behind a queue that is never full: Zenoh's default of 256 would block
-        # the receiving thread, and two nodes that wait for each other's would wait for ever.
-        subscriber = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(QUEUE))
-
-        def take_all() -> None:
-            for sample in subscriber:  # until it is undeclared, and then what had come
-                callback(sample)
-
-        thread = threading.Thread(target=take_all, name=key, daemon=True)
-        thread.start()
-        self._aside.append((subscriber, thread))
 
     def _answer_with(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
         handler = zenoh.handlers.Callback(callback, indirect=False)
@@ -333,6 +348,7 @@ class Bus:
 
     def _on_sample(self, port: str) -> Callable[[zenoh.Sample], None]:
         schemas: dict[str, str] = {}  # by encoding: there is one, or a few that are wrong
+        take = self._taking(port)
 
         def put(sample: zenoh.Sample) -> None:
             self._threads.know_this_one()
@@ -342,19 +358,26 @@ class Bus:
                 schema = encoding.rpartition(";")[2]
                 if len(schemas) < ENCODINGS_KEPT:
                     schemas[encoding] = schema
-            self._bring(Arrived(port, sample.payload.to_bytes(), schema, sent_at=sent_at(sample)))
+            take(Arrived(port, sample.payload.to_bytes(), schema, sent_at=sent_at(sample)))
 
         return put
 
+    def _taking(self, port: str) -> Callable[[Event], None]:
+        """Where what comes for an input port goes, in the order in which its writer sent it."""
+        lane = self._lanes.get(port)
+        return self._bring if lane is None else lane.put
+
     def _on_reply(self, port: str) -> Callable[[zenoh.Reply], None]:
+        take = self._inbox.put if self._lanes.get(port) is None else self._lanes[port].put
+
         def put(reply: zenoh.Reply) -> None:
             if reply.ok is None:
                 return
             schema = str(reply.ok.encoding).rpartition(";")[2]
             if schema != AGAIN:
-                self._inbox.put(Arrived(port, reply.ok.payload.to_bytes(), schema, again=True))
+                take(Arrived(port, reply.ok.payload.to_bytes(), schema, again=True))
             elif end := _control(reply.ok, Again):
-                self._inbox.put(Answered(port, end.first, end.mark))
+                take(Answered(port, end.first, end.mark))
 
         return put
 
@@ -375,11 +398,13 @@ class Bus:
         return put
 
     def _on_progress(self, ports: dict[str, str]) -> Callable[[zenoh.Sample], None]:
+        takes = {port: self._taking(own) for port, own in ports.items()}
+
         def put(sample: zenoh.Sample) -> None:
             progress = _control(sample, Progress)
             for port, mark in progress.ports.items() if progress else ():
                 if port in ports:
-                    self._bring(Marked(ports[port], mark))
+                    takes[port](Marked(ports[port], mark))
 
         return put
 

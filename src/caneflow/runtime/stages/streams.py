@@ -105,6 +105,11 @@ class Arrivals:
             return min(self.ahead)
         return None if self.mark is None else self.mark.last_seq + 1
 
+    @property
+    def newest(self) -> int:
+        """The seq of the last sample that is known to be sent."""
+        return max(self.expected - 1, max(self.ahead, default=-1), -1 if self.mark is None else self.mark.last_seq)
+
     def _refuse_old(self, message: Sample, *, again: bool) -> None:
         if again:
             self.counts.received -= 1
