@@ -1,6 +1,7 @@
 """A node takes samples on the thread that brings them: live while it is quick, in a replay always."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -124,7 +125,10 @@ def made(clock: Clock, tmp_path: Path) -> Callable[..., tuple[Any, Bus, Echo]]:
 
 
 def arrival(seq: int, x: float = 1.0) -> Arrived:
-    stamp = 10_000_000 * (seq + 1)
+    return sample(10_000_000 * (seq + 1), seq, x)
+
+
+def sample(stamp: int, seq: int, x: float = 1.0) -> Arrived:
     return Arrived("imu", numbered(Imu(stamp=stamp, gyro=(x, 0.0, 0.0)), seq), "caneflow.Imu/1")
 
 
@@ -281,6 +285,30 @@ def test_live_a_writer_that_is_silent_is_waited_for_longer_than_one_that_goes_on
         assert counts.lost == 1
         host.handle_what_is_due()
         assert counts.handled == (3 if goes_on else 2), "what came after it is handled"
+
+
+@pytest.mark.parametrize("stamp", [5, 3600, None])
+def test_what_lies_in_the_future_moves_nothing(made: Any, stamp: int | None) -> None:
+    """From whoever it comes; `stamp`: s from now, None: as late as can be said. Of the marks only the end counts."""
+    host, bus, _ = made()
+    now = time.time_ns()
+    late = 2**63 - 2 if stamp is None else now + stamp * 10**9
+    host.take_at_once(sample(now, 0))
+    host.take_at_once(sample(late, 1))
+    host.take_at_once(Marked("imu", PortMark(1, late)))
+    host.take_at_once(Answered("imu", 0, PortMark(1, late)))
+    host.take_at_once(sample(now + 1, 2))
+    assert len(bus.sent) == 2
+    assert host.stage.progress().handled == now + 1
+    assert bus.asked == [], "the one that was refused is not missing"
+    host.take_at_once(Marked("imu", PortMark(2, 2**63 - 1)))
+    assert host.stage.finished
+
+
+def test_a_replay_has_no_present(made: Any) -> None:
+    host, bus, _ = made(replay=True)
+    host.take_at_once(sample(time.time_ns() + 10**18, 0))
+    assert len(bus.sent) == 1
 
 
 def test_after_its_end_a_node_takes_no_more(made: Any) -> None:

@@ -95,10 +95,12 @@ def test_an_error_while_it_answers_ends_it_out_of_its_read() -> None:
         raise ZeroDivisionError("a bug of ours")
 
     bus.answer = fail
-    device.ask = lambda first: (  # type: ignore[method-assign]  # nobody answers
-        bus.put(Asked("imu", first, query=cast("zenoh.Query", None))),
-        threading.Event().wait(PATIENCE),
-    )
+
+    def ask(first: int) -> None:
+        bus.put(Asked("imu", first, query=cast("zenoh.Query", None)))
+        threading.Event().wait(PATIENCE)
+
+    device.ask = ask  # type: ignore[method-assign]  # nobody answers
     with pytest.raises(ZeroDivisionError, match="a bug of ours"):
         node._SourceNode(PLAN, bus, device).run()
 

@@ -14,7 +14,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.stages.merge import END
 from caneflow.runtime.stages.stage import Stage
-from caneflow.runtime.stages.streams import SILENCE
+from caneflow.runtime.stages.streams import FAR_AHEAD, SILENCE
 
 
 class Echo(Operator):
@@ -178,6 +178,65 @@ def test_what_is_too_old_for_a_live_graph_is_dropped() -> None:
     host.offer("a", imu(2_500_000, 1))
     assert emitted(host, now=3_000_000) == [(2_500_000, 0)]
     assert host.input_counts()["a"].dropped == 1
+
+
+NOW, LATER = 10**18, 10**18 + 60 * 10**9
+
+
+def test_a_sample_from_the_future_is_refused_and_holds_nothing_up(caplog: pytest.LogCaptureFixture) -> None:
+    host = stage()
+    host.close("b")
+    arrivals = host.inputs["a"]
+    arrivals.patient = True
+    assert arrivals.ahead_of(NOW + FAR_AHEAD, NOW) is None
+    ahead = arrivals.ahead_of(LATER, NOW)
+    assert ahead == 60 * 10**9
+    host.offer("a", imu(NOW, 0))
+    host.offer("a", imu(NOW + 2, 2))  # waits for 1
+    host.refuse_ahead("a", imu(LATER, 1), ahead)
+    host.refuse_ahead("a", imu(LATER, 1), ahead)  # came again
+    host.refuse_ahead("a", imu(LATER, 3), ahead)
+    host.offer("a", imu(NOW + 4, 4))
+    assert emitted(host) == [(NOW, 0), (NOW + 2, 1), (NOW + 4, 2)]
+    counts = host.input_counts()["a"]
+    assert (counts.received, counts.handled, counts.refused, counts.lost) == (5, 3, 2, 0)
+    assert host.progress().handled == NOW + 4
+    (record,) = caplog.records
+    assert record.message.startswith(
+        "f/a/imu: refused: seq 1 is stamped 60.0 s ahead of the clock; at most 1 s is taken"
+    )
+
+
+def test_a_sample_from_the_future_after_a_gap_is_not_lost_as_well() -> None:
+    host = stage()
+    host.inputs["a"].patient = True
+    host.offer("a", imu(NOW, 0))
+    host.refuse_ahead("a", imu(LATER, 2), 60 * 10**9)
+    host.offer("a", imu(NOW + 3, 3))
+    assert host.inputs["a"].missing_before == 3
+    host.skip_to("a", 3)
+    counts = host.input_counts()["a"]
+    assert (counts.lost, counts.refused, counts.waiting) == (1, 1, 2)
+
+
+@pytest.mark.parametrize(("offset", "late", "taken"), [(0, 2.0, False), (2 * 10**9, 2.0, True), (None, 3600.0, True)])
+def test_the_future_begins_on_the_writers_clock(offset: int | None, late: float, taken: bool) -> None:
+    arrivals = stage().inputs["a"]
+    arrivals.clock_offset = offset
+    assert (arrivals.ahead_of(NOW + round(late * 1e9), NOW) is None) is taken
+    assert arrivals.ahead_of(END, NOW) is None, "the end of a stream"
+    assert arrivals.ahead_of(END - 1, NOW) is not None, "whatever is known of the clock"
+
+
+def test_before_its_end_a_stage_promises_no_time_that_cannot_be() -> None:
+    host = stage()
+    host.offer("a", imu(10, 0))
+    host.close("a")
+    host.close("b")
+    host.step()
+    assert host.progress().ports["speed"] == PortMark(0, 10)
+    assert emitted(host) == [(END - 1, 1)]
+    assert host.progress().ports["speed"] == PortMark(1, END)
 
 
 def test_missing_samples_do_not_hold_a_mark_for_ever() -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 import msgspec
 
 from caneflow.messages import MessageError, Sample, decode, numbered
-from caneflow.messages.control import Again, Clock, Counters, Progress
+from caneflow.messages.control import Again, Clock, Counters, PortMark, Progress
 from caneflow.messages.rig import read_rig
 from caneflow.runtime.dataflow.programs import validated_settings
 from caneflow.runtime.hosts.bus import (
@@ -40,6 +40,7 @@ from caneflow.runtime.hosts.bus import (
     check_schema,
 )
 from caneflow.runtime.hosts.last_words import telling_failures
+from caneflow.runtime.hosts.present import Present
 from caneflow.runtime.hosts.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Encoded, Operator, Program, Quiet, Sink, Source
@@ -164,6 +165,7 @@ class _ReaderNode(ABC):
         self.reader = reader
         self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else LIVE_REPORT_PERIOD)
         self.stopped = False
+        self.present = Present()
         self._delays = {port: RecentDelays(live=not plan.replay) for port in plan.inputs}
         self._missing: dict[str, _Missing] = {}
         # Each writer is asked at the start what it has sent so far, until it answers: a node that is started anew may
@@ -274,11 +276,11 @@ class _ReaderNode(ABC):
             case Answered():
                 self._unanswered.pop(event.port, None)
                 self.begin_at(event.port, event.first)
-                self.reader.mark(event.port, event.mark)
+                self.take_mark(event.port, event.mark)
                 if event.first > self.reader.inputs[event.port].expected:
                     self.skip_to(event.port, event.first)  # the writer does not have what lies before it any more
             case Marked():
-                self.reader.mark(event.port, event.mark)
+                self.take_mark(event.port, event.mark)
             case Noted() if isinstance(self.reader, Tap):
                 self.reader.note(event.key, event.payload, time.time_ns())
             case Timed():
@@ -289,6 +291,15 @@ class _ReaderNode(ABC):
                 raise error
             case _:
                 pass  # for sources
+
+    def take_mark(self, port: str, mark: PortMark) -> None:
+        """Take a writer's word on how far it has come, unless it lies where it cannot be yet."""
+        arrivals = self.reader.inputs[port]
+        ahead = None if self.plan.replay else arrivals.ahead_of(mark.watermark, self.present.now())
+        if ahead is None:
+            self.reader.mark(port, mark)
+        else:
+            arrivals.refuse_mark(ahead)
 
     def set_clock(self, clock: Clock) -> None:
         """Take note of how far a writer's clock is from this machine's."""
@@ -306,13 +317,21 @@ class _ReaderNode(ABC):
         except MessageError as error:
             self.reader.refuse(arrived.port, error)
             return None
-        offset = self.reader.inputs[arrived.port].clock_offset
+        arrivals = self.reader.inputs[arrived.port]
+        if not self.plan.replay and (ahead := arrivals.ahead_of(message.stamp, self.present.now())) is not None:
+            self.refuse_ahead(arrived, message, ahead)
+            return None
+        offset = arrivals.clock_offset
         if not (self.plan.replay or arrived.again):
             self._unanswered.pop(arrived.port, None)  # live: what is missing before it shows by its number
         if offset is not None and (arrived.sent_at or not (self.plan.replay or arrived.again)):
             sent_at = arrived.sent_at and arrived.sent_at - offset
             self._delays[arrived.port].note(time.time_ns(), sent_at, message.stamp - offset)
         return message
+
+    @abstractmethod
+    def refuse_ahead(self, arrived: Arrived, message: Sample, ahead: int) -> None:
+        """Refuse a sample that is stamped `ahead` ns in the future."""
 
     @abstractmethod
     def take_message(self, arrived: Arrived, message: Sample) -> None:
@@ -463,6 +482,9 @@ class _OperatorNode(_ReaderNode):
             if port != arrived.port:
                 others.append((time.monotonic(), message.stamp))
         self.stage.offer(arrived.port, message, again=arrived.again)
+
+    def refuse_ahead(self, arrived: Arrived, message: Sample, ahead: int) -> None:
+        self.stage.refuse_ahead(arrived.port, message, ahead, again=arrived.again)
 
     def skip_to(self, port: str, seq: int) -> None:
         self.stage.skip_to(port, seq)
@@ -633,6 +655,9 @@ class _SinkNode(_ReaderNode):
             arrivals.expected = seq
             self.skip_to(port, seq)
 
+    def refuse_ahead(self, arrived: Arrived, message: Sample, ahead: int) -> None:
+        self.tap.refuse_ahead(arrived.port, message, ahead, time.time_ns(), again=arrived.again)
+
     def skip_to(self, port: str, seq: int) -> None:
         self.tap.skip_to(port, seq, time.time_ns())
 
@@ -656,6 +681,7 @@ class _SourceNode:
         self.stopped = False
         self.broken: BaseException | None = None  # raised on the second thread
         self.until = BEGIN if plan.replay else END  # how far a replay may send
+        self._present = Present()
 
     def at(self) -> str | None:
         """The sample that was sent last; None: the node has not begun."""
@@ -704,7 +730,7 @@ class _SourceNode:
 
     def send(self, port: str, sample: Sample | Encoded) -> None:
         with self.lock:
-            payload = self.feed.take(port, sample)
+            payload = self.feed.take(port, sample, self.now())
             seq = self.feed.outputs[port].sent - 1
         if payload is not None:
             # First sent, then kept: what is sent again on request never arrives before the sample itself. And without
@@ -716,9 +742,13 @@ class _SourceNode:
     def report(self, nothing_until: int = BEGIN) -> None:
         """Say how far the source has come; no sample up to the stamp `nothing_until` (ns) will follow."""
         with self.lock:
-            self.feed.nothing_until(nothing_until)
+            self.feed.nothing_until(nothing_until, self.now())
             progress = self.feed.progress()
         self.reports.progress(progress)
+
+    def now(self) -> int | None:
+        """The clock (ns) that no sample may lie far ahead of; a replay has none."""
+        return None if self.plan.replay else self._present.now()
 
     def wait_for_window(self, stamp: int) -> None:
         """Hold a replay's sample back until the readers have come near enough."""

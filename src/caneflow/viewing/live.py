@@ -25,6 +25,9 @@ PICTURE_PERIOD = 0.1  # s between two range-Doppler maps
 TRAFFIC_PERIOD = 0.5  # s between two tables of rates
 RATE_SPAN = 2.0  # s that a rate is counted over
 KEPT_ARRIVALS = 4_000
+FAR_AHEAD_NS = (
+    3600_000_000_000  # a live sample that is stamped later is of no clock; another machine's may be set badly
+)
 STALE_CLOCK_NS = 60_000_000_000  # an older sample is a replay's: its stamp says nothing of its age
 
 
@@ -70,6 +73,8 @@ class LiveStreams:
 
     def take(self, name: str, message: Sample, received: int) -> None:
         """Take a sample of the stream `name` (node/port), received at `received` ns."""
+        if self._live and message.stamp - received > FAR_AHEAD_NS:
+            return  # it would be drawn where nothing else comes for ever; its number counts as missing
         row = row_of(message, self._boresight)
         with self._lock:
             if self._origin is None:

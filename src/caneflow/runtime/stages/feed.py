@@ -9,7 +9,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import OutputPlan
 from caneflow.runtime.program import Encoded
 from caneflow.runtime.stages.merge import BEGIN, END
-from caneflow.runtime.stages.streams import Departures
+from caneflow.runtime.stages.streams import FAR_AHEAD, Departures, lies_ahead
 
 log = logging.getLogger(__name__)
 
@@ -24,12 +24,20 @@ class Feed:
         self.unsent = dict.fromkeys(outputs, 0)  # by port the samples that the source brought and that cannot be sent
         self._ordered = ordered  # stamps increase over all ports together
         self._quiet = BEGIN
+        self._named: set[str] = set()  # kinds of cause
 
-    def take(self, port: str, sample: Sample | Encoded) -> bytes | None:
-        """The bytes to send for what the source brought on `port`; None when it cannot be sent."""
+    def take(self, port: str, sample: Sample | Encoded, now: int | None = None) -> bytes | None:
+        """The bytes to send for what the source brought on `port`; None when it cannot be sent.
+
+        `now` (ns) is the host's clock, given by a live host only: no stamp may lie far ahead of it.
+        """
         departures = self.outputs.get(port)
         if departures is None:
             raise DataflowError(f"{self.node}: brought port {port!r}; it has {', '.join(self.outputs) or 'none'}")
+        if now is not None and sample.stamp - now > FAR_AHEAD:
+            self._say_once("ahead", f"{departures.plan.key}: not sent, a sample {lies_ahead(sample.stamp - now)}")
+            self.unsent[port] += 1
+            return None
         if self._ordered:
             self.nothing_until(sample.stamp - 1)
         payload = self._payload(departures, sample)
@@ -42,9 +50,11 @@ class Feed:
         """How many samples the source brought that cannot be sent."""
         return sum(self.unsent.values())
 
-    def nothing_until(self, stamp: int) -> None:
-        """Note that no further sample with a stamp at or before `stamp` (ns) will be brought."""
-        if stamp > self._quiet:
+    def nothing_until(self, stamp: int, now: int | None = None) -> None:
+        """Note that no further sample with a stamp at or before `stamp` (ns) will be brought; `now` as in `take`."""
+        if now is not None and stamp - now > FAR_AHEAD:
+            self._say_once("quiet", f"{self.node}: its silence {lies_ahead(stamp - now)}; ignored")
+        elif stamp > self._quiet:
             self._quiet = stamp
 
     def progress(self) -> Progress:
@@ -58,9 +68,8 @@ class Feed:
     def _payload(self, departures: Departures, sample: Sample | Encoded) -> bytes | None:
         """The sample's bytes under its number in this run: a recording may begin in the middle, or have gaps."""
         if sample.stamp <= departures.last_stamp:
-            if not self.refused:
-                stamps = f"stamp {sample.stamp} after {departures.last_stamp}"
-                log.warning("%s: not sent, time goes backwards: %s (counted from now on)", departures.plan.key, stamps)
+            stamps = f"stamp {sample.stamp} after {departures.last_stamp}"
+            self._say_once("backwards", f"{departures.plan.key}: not sent, time goes backwards: {stamps}")
             return None
         if isinstance(sample, Encoded):
             if sample.seq == departures.sent:
@@ -69,7 +78,11 @@ class Feed:
             try:
                 sample = decode(sample.payload, sample.kind)
             except MessageError as error:
-                if not self.refused:
-                    log.warning("%s: not sent, a bad sample: %s (counted from now on)", departures.plan.key, error)
+                self._say_once("bad", f"{departures.plan.key}: not sent, a bad sample: {error}")
                 return None
         return numbered(sample, departures.number(sample))
+
+    def _say_once(self, kind: str, text: str) -> None:
+        if kind not in self._named:
+            self._named.add(kind)
+            log.warning("%s (counted from now on, not repeated)", text)

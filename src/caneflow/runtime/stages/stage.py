@@ -57,6 +57,13 @@ class Stage:
         self.inputs[port].refuse_unreadable(error)
         self._count_mark(port, self.inputs[port])
 
+    def refuse_ahead(self, port: str, message: Sample, ahead: int, *, again: bool = False) -> None:
+        """Refuse a live sample on `port` that is stamped `ahead` ns in the future."""
+        arrivals = self.inputs[port]
+        for each in arrivals.refuse_ahead(message, ahead, again=again):
+            self._queue(port, arrivals, each)
+        self._count_mark(port, arrivals)
+
     def skip_to(self, port: str, seq: int) -> None:
         """Stop waiting for samples of `port` before `seq` that were sent and did not arrive."""
         arrivals = self.inputs[port]
@@ -112,7 +119,9 @@ class Stage:
     def progress(self) -> Progress:
         """How far the node has come: what is handled can cause no further output."""
         handled = END if self.finished else min(self._merge.handled(), END - 1)
-        marks = {port: PortMark(out.sent - 1, handled) for port, out in self.outputs.items()}
+        # Between the last sample and what follows from the end, no time that could be stamped is promised.
+        told = handled if handled != END - 1 else max(each.handled_stamp for each in self.inputs.values())
+        marks = {port: PortMark(out.sent - 1, told) for port, out in self.outputs.items()}
         return Progress(self.node, handled, marks)
 
     def state(self) -> StageState:

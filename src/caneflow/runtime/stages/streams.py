@@ -8,7 +8,7 @@ from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, LeftOut, PortMark
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
-from caneflow.runtime.stages.merge import BEGIN
+from caneflow.runtime.stages.merge import BEGIN, END
 
 log = logging.getLogger(__name__)
 
@@ -16,6 +16,10 @@ NOTES_KEPT = 10_000  # per stream, until a live host has told them
 AHEAD_KEPT = 20_000  # samples of one stream that may wait for what is missing before them
 CAUSES_NAMED = 100  # per stream: a hostile writer must not fill the memory
 SILENCE = 1_000_000_000  # ns from one stamp of a stream to the next that are worth a line
+FAR_AHEAD = (
+    1_000_000_000  # ns that a live stamp may lie ahead of its clock, which is known to some ms; sensors stamp the past
+)
+FAR_AHEAD_UNKNOWN = 100 * 365 * 86_400 * 1_000_000_000  # ns, while the writer's clock is not known: 1970 to 2070
 SILENCES_NAMED = 10  # per stream: one that is slow is not to be complained of for ever
 
 
@@ -51,6 +55,28 @@ class Arrivals:
         self.counts.received += 1
         self.unreadable += 1
         self.refuse(error)
+
+    def ahead_of(self, stamp: int, now: int) -> int | None:
+        """How far (ns) a live stamp lies ahead of its writer's clock, if too far; `now`: this machine's (ns)."""
+        ahead = stamp - now - (self.clock_offset or 0)
+        bound = FAR_AHEAD if self.clock_offset is not None else FAR_AHEAD_UNKNOWN
+        return ahead if ahead > bound and stamp != END else None
+
+    def refuse_ahead(self, message: Sample, ahead: int, *, again: bool = False) -> list[Sample]:
+        """Refuse a sample that lies `ahead` (ns) of its writer's clock; those that waited for its number only."""
+        had_come = message.seq < self.expected or message.seq in self.ahead
+        if not (again or had_come):
+            self.counts.received += 1
+            self.refuse(f"seq {message.seq} {lies_ahead(ahead)}", "ahead")
+        if message.seq == self.expected:  # nobody has to ask for it
+            self.expected, self.unreadable = message.seq + 1, 0
+            return self._caught_up()
+        self.unreadable += not (again or had_come)
+        return []
+
+    def refuse_mark(self, ahead: int) -> None:
+        """Name a writer's word on how far it has come that lies `ahead` (ns) of its clock; it moves nothing."""
+        self._say_once("mark", f"a progress mark {lies_ahead(ahead)}; refused")
 
     def admit(self, message: Sample, *, again: bool = False) -> list[Sample]:
         """The samples that are next in the stream now that `message` has come; counts it, and what is missing.
@@ -197,6 +223,11 @@ class Arrivals:
             return None
         watermark, self.mark = self.mark.watermark, None
         return watermark
+
+
+def lies_ahead(ahead: int) -> str:
+    """What is wrong with a stamp that is `ahead` ns in the future."""
+    return f"is stamped {ahead / 1e9:.1f} s ahead of the clock; at most {FAR_AHEAD / 1e9:g} s is taken"
 
 
 @dataclass

@@ -40,6 +40,12 @@ class Tap:
         self.inputs[port].refuse_unreadable(error)
         self._count_mark(port)
 
+    def refuse_ahead(self, port: str, message: Sample, ahead: int, time: int, *, again: bool = False) -> None:
+        """Refuse a live sample on `port` that is stamped `ahead` ns in the future."""
+        for each in self.inputs[port].refuse_ahead(message, ahead, again=again):
+            self._take(port, each, time)
+        self._count_mark(port)
+
     def mark(self, port: str, mark: PortMark) -> None:
         """Take the writer's word on how far the stream of `port` has come."""
         self.inputs[port].note_mark(mark)
