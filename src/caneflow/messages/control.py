@@ -83,6 +83,8 @@ class Counters(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     unsent: dict[str, int] = {}  # the same by output port
     delays: dict[str, Delays] = {}  # by input port; from processes only
     ended: bool = False  # everything has come, and what followed is sent
+    held: int = 0  # bytes of samples: sent and not confirmed, or waiting to be handled
+    let_go: int = 0  # samples sent that can no longer be had again, though some reader has not confirmed them
 
 
 class Clock(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -116,6 +118,8 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     listen: tuple[str, ...] = ()  # Zenoh endpoints
     machine: str = ""  # its name in the file; "" when the flow has only one
     connect: tuple[str, ...] = ()  # whom it dials: its launcher, and the writers of its inputs
+    held: int = 0  # bytes of samples that it keeps: sent and not confirmed, or waiting to be handled
+    let_go: int = 0  # samples sent that can no longer be had again, though some reader has not confirmed them
 
 
 class EdgeStatus(msgspec.Struct, frozen=True, kw_only=True):

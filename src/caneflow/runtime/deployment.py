@@ -20,6 +20,7 @@ from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links import Ports, Sockets
 from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
+from caneflow.runtime.stages.byte_budget import SENT, share
 from caneflow.runtime.wording import did_you_mean, listed
 
 LeftOutStamps: TypeAlias = dict[tuple[str, str], set[int]]
@@ -444,14 +445,25 @@ def _with_readers(plan: NodePlan, plans: dict[str, NodePlan], rig: dict[str, Any
         readers = [other for other in plans.values() if any(wire.key == out.key for wire in other.inputs.values())]
         awaited = any(len(other.inputs) > 1 and other.outputs for other in readers)
         names = tuple(other.node for other in readers)
-        outputs[port] = msgspec.structs.replace(out, readers=names, awaited=awaited)
-    inputs = plan.inputs
+        outputs[port] = msgspec.structs.replace(
+            out, readers=names, awaited=awaited, budget=_budget(out.key, plan, plans)
+        )
+    inputs = {
+        port: msgspec.structs.replace(wire, budget=_budget(wire.key, plans[wire.writer], plans))
+        for port, wire in plan.inputs.items()
+    }
     if replay:  # nothing may be lost, and nobody has a clock to lag behind: the sources wait instead
         inputs = {
             port: msgspec.structs.replace(wire, length=None, max_lag_ms=None, max_age_ms=None)
-            for port, wire in plan.inputs.items()
+            for port, wire in inputs.items()
         }
     return msgspec.structs.replace(plan, outputs=outputs, rig=rig, replay=replay, inputs=inputs)
+
+
+def _budget(key: str, writer: NodePlan, plans: Mapping[str, NodePlan]) -> int:
+    """How many bytes of one stream may be on their way, so that neither its writer nor a reader of it has too many."""
+    most = [len(plan.inputs) for plan in plans.values() if any(wire.key == key for wire in plan.inputs.values())]
+    return share(SENT, max(len(writer.outputs), *most, 1))
 
 
 def program_arguments(plan: NodePlan) -> Sequence[str]:

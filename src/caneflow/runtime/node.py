@@ -44,6 +44,7 @@ from caneflow.runtime.hosts.present import Present
 from caneflow.runtime.hosts.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Encoded, Operator, Program, Quiet, Sink, Source
+from caneflow.runtime.stages.byte_budget import WAITING, weight
 from caneflow.runtime.stages.feed import Feed
 from caneflow.runtime.stages.history import History
 from caneflow.runtime.stages.merge import BEGIN, END
@@ -51,6 +52,7 @@ from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.seeds import generator
 from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
 from caneflow.runtime.stages.stage import Stage
+from caneflow.runtime.stages.streams import AHEAD_KEPT
 from caneflow.runtime.stages.tap import Tap
 from caneflow.runtime.wording import one_line
 
@@ -115,6 +117,12 @@ def _run(program: Program, plan: NodePlan, snapshots: Path) -> None:
             node.run()
 
 
+def _history(plan: NodePlan) -> History:
+    """What the node has sent: in a replay it waits while that is too much, live it forgets the oldest."""
+    readers = {port: out.readers for port, out in plan.outputs.items()}
+    return History(readers, {port: out.budget for port, out in plan.outputs.items()}, waits=plan.replay)
+
+
 class _Reports:
     """When a node says how far it has come: at once when its readers need to know, else now and then."""
 
@@ -159,6 +167,8 @@ class _Missing:
 class _ReaderNode(ABC):
     """What a node with inputs does on a bus, whether operator or sink."""
 
+    history: History | None = None  # what it has sent; a sink sends nothing
+
     def __init__(self, plan: NodePlan, bus: Bus, reader: Stage | Tap) -> None:
         self.plan = plan
         self.bus = bus
@@ -171,6 +181,8 @@ class _ReaderNode(ABC):
         # Each writer is asked at the start what it has sent so far, until it answers: a node that is started anew may
         # have missed its last word, and the link to the writer may not be there yet.
         self._unanswered = dict.fromkeys(plan.inputs, 0.0)  # s, monotonic: when to ask next
+        self._dropped = dict.fromkeys(plan.inputs, 0)  # unseen, as was counted
+        reader.bound(WAITING)
         self.lock = threading.RLock()  # over all of this node's state
         self._quick = True
         self._slow = 0.0  # share of events
@@ -377,21 +389,38 @@ class _ReaderNode(ABC):
     def count(self, outputs: dict[str, int], *, at_once: bool = False) -> None:
         if not (at_once or self.reports.counters_due()):
             return
+        self.count_dropped()
         now = time.time_ns()
         inputs = self.reader.inputs
         delays = {port: each.spread(now, inputs[port].handled_age) for port, each in self._delays.items()}
         counts = self.reader.input_counts()
         counters = Counters(
-            node=self.plan.node, inputs=counts, outputs=outputs, delays=delays, ended=self.reader.finished
+            node=self.plan.node,
+            inputs=counts,
+            outputs=outputs,
+            delays=delays,
+            ended=self.reader.finished,
+            held=self.bus.held + self.reader.held + (self.history.held if self.history else 0),
+            let_go=self.history.let_go if self.history else 0,
         )
         self.reports.counters(counters, at_once=at_once)
+
+    def count_dropped(self) -> None:
+        """Count the samples for which the inbox had no room."""
+        for port, dropped in self.bus.dropped.items():
+            if fresh := dropped - self._dropped[port]:
+                self._dropped[port] = dropped
+                self.reader.inputs[port].drop_unseen(fresh)
 
 
 class _OperatorNode(_ReaderNode):
     def __init__(self, plan: NodePlan, bus: Bus, operator: Operator, snapshots: Path) -> None:
         self.stage = Stage(plan.node, operator, plan.inputs, plan.outputs)
         super().__init__(plan, bus, self.stage)
-        self.history = History({port: out.readers for port, out in plan.outputs.items()})
+        self.history: History = _history(plan)
+        # In a replay, where writers wait for it: bytes after which a snapshot confirms what was handled.
+        self._snapshot_bytes = min(wire.budget for wire in plan.inputs.values()) // 2
+        self._since_snapshot = 0  # bytes of samples that came
         self.keeper = SnapshotKeeper(snapshots, operator)
         self.marked: Progress | None = None  # what readers that wait were told last
         self.confirmed: dict[str, int] = {}  # by input key what the last snapshot has handled
@@ -399,7 +428,9 @@ class _OperatorNode(_ReaderNode):
         self._next_snapshot = time.monotonic() + self._snapshot_period
         # Live: for each input that may lag, when the samples of the others came, and their stamps.
         self._others: dict[str, deque[tuple[float, int]]] = {
-            port: deque() for port, wire in plan.inputs.items() if wire.max_lag_ms is not None and not plan.replay
+            port: deque(maxlen=AHEAD_KEPT)
+            for port, wire in plan.inputs.items()
+            if wire.max_lag_ms is not None and not plan.replay
         }
 
     def run(self) -> None:
@@ -435,7 +466,9 @@ class _OperatorNode(_ReaderNode):
         if message is None:
             self.follow_up(arrived)
             return
-        emitted = self.stage.handle_at_once(arrived.port, message, self.now())
+        if self.plan.replay:
+            self._since_snapshot += weight(arrived.payload)
+        emitted = None if self.history.full else self.stage.handle_at_once(arrived.port, message, self.now())
         if emitted is None:
             self.take_message(arrived, message)
             if self.stage.inputs[arrived.port].ahead:
@@ -454,9 +487,13 @@ class _OperatorNode(_ReaderNode):
     def follow_up(self, event: Event) -> None:
         if isinstance(event, Confirmed):
             return
-        while (emitted := self.stage.step(self.now())) is not None:
+        while (emitted := self.step()) is not None:
             self.send(emitted)
         self.tell_who_waits()
+
+    def step(self) -> list[tuple[str, Sample, int]] | None:
+        """What follows from the next sample that is due; None: none is, or a replay's readers have to come on first."""
+        return None if self.history.full else self.stage.step(self.now())
 
     def tell_who_waits(self) -> None:
         """Say at once how far this node has come, when a reader cannot see it from the samples and waits for it."""
@@ -492,7 +529,7 @@ class _OperatorNode(_ReaderNode):
     def handle_what_is_due(self) -> bool:
         """Handle samples until none is due, or for so long that all else would wait; whether more may be due."""
         until = time.monotonic() + self.look_period
-        while (emitted := self.stage.step(self.now())) is not None:
+        while (emitted := self.step()) is not None:
             self.send(emitted)
             self.report_if_due()
             if self.bus.pending():
@@ -523,8 +560,10 @@ class _OperatorNode(_ReaderNode):
     def keep_snapshot(self) -> None:
         """Now and then: what a new process in this one's place needs to go on."""
         with self.lock:
-            if self._broken is not None or time.monotonic() < self._next_snapshot:
+            due = time.monotonic() >= self._next_snapshot or self._since_snapshot >= self._snapshot_bytes
+            if self._broken is not None or not due or self._next_snapshot == math.inf:
                 return
+            self._since_snapshot = 0
             self._next_snapshot = math.inf  # until this one is kept
             handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
             fresh = handled != self.confirmed
@@ -674,7 +713,7 @@ class _SourceNode:
         self.bus = bus
         self.source = source
         self.feed = Feed(plan.node, plan.outputs, ordered=source.ordered)
-        self.history = History({port: out.readers for port, out in plan.outputs.items()})
+        self.history = _history(plan)
         self.reports = _Reports(bus, REPORT_PERIOD if plan.replay else LIVE_REPORT_PERIOD)
         self.lock = threading.Condition()  # over all of this node's state; told when something has come
         self.started = False
@@ -721,6 +760,7 @@ class _SourceNode:
                     continue
                 port, sample = item
                 self.wait_for_window(sample.stamp)
+                self.wait_for_room(sample.stamp)
                 self.send(port, sample)
                 if self.reports.due():
                     self.report()
@@ -755,6 +795,13 @@ class _SourceNode:
         while stamp > self.until and not self.stopped:
             self.report(stamp - 1)
             self.wait_for(lambda: stamp <= self.until, SAY_AGAIN_PERIOD)
+
+    def wait_for_room(self, stamp: int) -> None:
+        """Hold a replay's sample back while readers have not confirmed more than they, and this node, may hold."""
+        while self.history.full and not self.stopped:
+            self.report(stamp - 1)
+            self.count()
+            self.wait_for(lambda: not self.history.full, SAY_AGAIN_PERIOD)
 
     def take_all_events(self) -> None:
         """Take what comes, however long the source is silent: a restarted reader asks for what it missed."""
@@ -821,5 +868,7 @@ class _SourceNode:
             refused=self.feed.refused,
             unsent=dict(unsent),
             ended=self.feed.ended,
+            held=self.history.held,
+            let_go=self.history.let_go,
         )
         self.reports.counters(counters, at_once=at_once)

@@ -8,6 +8,7 @@ import msgspec
 
 from caneflow.messages import SAMPLES, Sample
 from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.stages.byte_budget import SENT
 
 
 class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
@@ -21,6 +22,7 @@ class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     max_lag_ms: float | None = None  # live: how long the graph waits for this input. None: for ever
     max_age_ms: float | None = None  # live: older samples are dropped. None: never
     left_out: tuple[int, ...] = ()  # stamps (ns) of samples that the recorded live run did not handle
+    budget: int = SENT  # bytes that its writer may keep of it
 
     @cached_property
     def kind(self) -> type[Sample]:
@@ -39,6 +41,7 @@ class OutputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     key: str
     schema: str
     readers: tuple[str, ...] = ()  # the nodes that read it, the recorder among them
+    budget: int = SENT  # bytes that may be sent and not yet confirmed by every reader
     awaited: bool = True  # one of them puts it in order with other streams: it waits to hear how far this one has come
 
     @cached_property

@@ -17,10 +17,13 @@ import msgspec
 import zenoh
 
 from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, encode
+from caneflow.messages.codec import MAX_SEQ
 from caneflow.messages.control import Again, Clock, Counters, LeftOut, PortMark, Progress, Window
 from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.hosts.inbox import Inbox
 from caneflow.runtime.hosts.links import KnownThreads, open_session, sending_now, sent_at
 from caneflow.runtime.plan import InputPlan, NodePlan
+from caneflow.runtime.stages.byte_budget import CONTROL, INBOX, PER_SAMPLE, share
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +34,7 @@ ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
 TIMED_PERIOD = 0.047  # s between two in a live run; odd as well
 ENCODINGS_KEPT = 8
+LONGEST_ENCODING = 256  # characters
 HEARING_OUT = 1.0  # s, at most, for what has come when a node is to end
 POLL = 0.01  # s between two looks at a condition that Zenoh does not signal
 
@@ -129,20 +133,25 @@ class _Lane:
     an answer never overtakes the samples that its writer sent before it: they would seem missing.
     """
 
-    def __init__(self, name: str, bring: Callable[[Event], None]) -> None:
-        self._queue: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
-        self.put = self._queue.put
+    def __init__(self, name: str, inbox: Inbox[Event], bring: Callable[[Event], None]) -> None:
+        self._inbox = inbox
+        self.put = inbox.put
         self._bring = bring
         self._thread = threading.Thread(target=self._bring_all, name=name, daemon=True)
         self._thread.start()
 
     def end(self) -> None:
         """Bring what has come, and no more."""
-        self._queue.put(None)
+        self._inbox.put(Stopped())
         self._thread.join(HEARING_OUT)
 
+    @property
+    def held(self) -> int:
+        """What waits, in bytes."""
+        return self._inbox.held
+
     def _bring_all(self) -> None:
-        while (event := self._queue.get()) is not None:
+        while type(event := self._inbox.get()) is not Stopped:
             self._bring(event)
 
 
@@ -152,7 +161,9 @@ class Bus:
     def __init__(self, plan: NodePlan) -> None:
         self.ready = False  # it hears, is heard, and has said so
         self._plan = plan
-        self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self.dropped = dict.fromkeys(plan.inputs, 0)  # by input port: samples for which there was no room
+        self._unheard = False  # a mark or a request was dropped, as was said
+        self._inbox = self._new_inbox(CONTROL if plan.replay else INBOX)
         # Takes an event on the thread that brought it; False: it did not, and the event goes into the inbox.
         self.at_once: Callable[[Event], bool] | None = None
         self._threads = KnownThreads()
@@ -204,6 +215,22 @@ class Bus:
     def put(self, event: Event) -> None:
         """Add an event of this process's own; safe in a signal handler."""
         self._inbox.put(event)
+
+    @property
+    def held(self) -> int:
+        """What has come and waits to be looked at, in bytes."""
+        return self._inbox.held + sum(lane.held for lane in self._lanes.values())
+
+    def _new_inbox(self, budget: int) -> Inbox[Event]:
+        # Live the newest counts; in a replay no more is on its way than there is room for, unless somebody forges.
+        return Inbox(budget, _weight, self._drop, oldest_first=not self._plan.replay)
+
+    def _drop(self, event: Event) -> None:
+        if isinstance(event, Arrived):
+            self.dropped[event.port] += not event.again  # else it is asked for once more
+        elif not self._unheard:
+            self._unheard = True
+            log.warning("%s: more marks and requests come than it can take; dropped", self._plan.node)
 
     def _bring(self, event: Event) -> None:
         if self.at_once is None or not self.at_once(event):
@@ -288,7 +315,8 @@ class Bus:
         by_writer: dict[str, dict[str, str]] = {}  # writer -> its port -> this node's port
         for port, wire in plan.inputs.items():
             if plan.replay:
-                self._lanes[port] = _Lane(wire.key, self._bring)
+                inbox = self._new_inbox(share(INBOX, len(plan.inputs)))
+                self._lanes[port] = _Lane(wire.key, inbox, self._bring)
                 handler = zenoh.handlers.Callback(self._on_sample(port), indirect=False)
                 self._subscribers.append(self._session.declare_subscriber(wire.key, handler))
             else:
@@ -356,7 +384,7 @@ class Bus:
             schema = schemas.get(encoding)
             if schema is None:
                 schema = encoding.rpartition(";")[2]
-                if len(schemas) < ENCODINGS_KEPT:
+                if len(schemas) < ENCODINGS_KEPT and len(encoding) < LONGEST_ENCODING:
                     schemas[encoding] = schema
             take(Arrived(port, sample.payload.to_bytes(), schema, sent_at=sent_at(sample)))
 
@@ -383,8 +411,8 @@ class Bus:
 
     def _on_asked(self, port: str) -> Callable[[zenoh.Query], None]:
         def put(query: zenoh.Query) -> None:
-            first = query.payload.to_string() if query.payload is not None else ""
-            if first.isascii() and first.isdigit():
+            first = query.payload.to_bytes() if query.payload is not None else b""
+            if first.isdigit() and len(first) <= len(str(MAX_SEQ)):  # else nobody of ours asks
                 self._inbox.put(Asked(port, int(first), query))
 
         return put
@@ -424,6 +452,22 @@ class Bus:
         window = _control(sample, Window)
         if window:
             self._inbox.put(Opened(window.until))
+
+
+def _weight(event: Event) -> int:
+    """What an event takes in the inbox, in bytes; 0: it is the launcher's or this process's own."""
+    kind = type(event)
+    if kind is Arrived:
+        return PER_SAMPLE + len(event.payload) + len(event.schema)  # type: ignore[union-attr]  # the kind says it
+    match event:
+        case Started() | Stopped() | Broken():
+            return 0
+        case Noted():
+            return PER_SAMPLE + len(event.payload)
+        case Questioned():
+            return PER_SAMPLE + len(event.question)
+        case _:
+            return PER_SAMPLE
 
 
 def _say_yes(key: str, query: zenoh.Query) -> None:

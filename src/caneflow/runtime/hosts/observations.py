@@ -157,6 +157,8 @@ class Observations:
             machine=machine,
             listen=node.plan.links.listen,
             connect=node.plan.links.connect,
+            held=counted.now.held if counted else 0,
+            let_go=counted.now.let_go if counted else 0,
         )
 
     def _edges(self, name: str, node: ObservedNode) -> Iterable[EdgeStatus]:

@@ -4,7 +4,9 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-LONGEST = 20_000  # samples per stream; a reader that makes sure of nothing must not fill the memory
+from caneflow.runtime.stages.byte_budget import PER_SAMPLE, SENT
+
+LONGEST = 20_000  # samples per stream of a live run; a reader that makes sure of nothing must not fill the memory
 
 
 class Kept(NamedTuple):
@@ -17,11 +19,26 @@ class Kept(NamedTuple):
 class History:
     """The samples of each output port, from the oldest that some reader may still ask for."""
 
-    def __init__(self, readers: Mapping[str, Iterable[str]]) -> None:
-        """`readers`: by output port the names of the nodes that read it."""
+    def __init__(
+        self, readers: Mapping[str, Iterable[str]], budgets: Mapping[str, int] | None = None, *, waits: bool = False
+    ) -> None:
+        """By output port: the names of the nodes that read it, and how many bytes may be kept.
+
+        What exceeds that is let go, the oldest first; `waits`: nothing is, who sends waits while a port is full.
+        """
         self._kept: dict[str, deque[Kept]] = {port: deque() for port in readers}
         self._confirmed = {port: dict.fromkeys(names, -1) for port, names in readers.items()}
         self._next: dict[str, int] = dict.fromkeys(readers, 0)
+        self._held: dict[str, int] = dict.fromkeys(readers, 0)  # bytes
+        self._budgets = budgets or dict.fromkeys(readers, SENT)
+        self._waits = waits
+        self.full: set[str] = set()  # ports whose samples take more than the budget
+        self.let_go = 0  # samples that cannot be had again, though some reader has not confirmed them
+
+    @property
+    def held(self) -> int:
+        """What everything that is kept takes, in bytes."""
+        return sum(self._held.values())
 
     def keep(self, port: str, seq: int, payload: bytes) -> None:
         """Keep a sample that is being sent."""
@@ -29,8 +46,22 @@ class History:
         if self._confirmed[port]:  # nobody reads it: nobody will ask
             kept = self._kept[port]
             kept.append(Kept(seq, payload))
-            if len(kept) > LONGEST:
-                kept.popleft()
+            held = self._held[port] = self._held[port] + PER_SAMPLE + len(payload)
+            if held > self._budgets[port] or len(kept) > LONGEST:
+                self._make_room(port)
+
+    def _make_room(self, port: str) -> None:
+        kept = self._kept[port]
+        if self._waits:
+            if self._held[port] > self._budgets[port]:
+                self.full.add(port)
+            return
+        while len(kept) > 1 and (self._held[port] > self._budgets[port] or len(kept) > LONGEST):
+            self._forget_oldest(port)
+            self.let_go += 1
+
+    def _forget_oldest(self, port: str) -> None:
+        self._held[port] -= PER_SAMPLE + len(self._kept[port].popleft().payload)
 
     def confirm(self, port: str, reader: str, seq: int) -> None:
         """Note that `reader` will not ask for the sample `seq` of `port` or one before it."""
@@ -39,7 +70,9 @@ class History:
             confirmed[reader] = max(confirmed[reader], seq)
             sure, kept = min(confirmed.values()), self._kept[port]
             while kept and kept[0].seq <= sure:
-                kept.popleft()
+                self._forget_oldest(port)
+            if self._held[port] <= self._budgets[port]:
+                self.full.discard(port)
 
     def first(self, port: str) -> int:
         """The seq of the oldest sample of `port` that can be sent again; that of the next one when there is none."""

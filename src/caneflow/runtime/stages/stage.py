@@ -15,6 +15,7 @@ from caneflow.messages.control import InputCounts, LeftOut, PortMark, Progress
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.program import Operator, Refused
+from caneflow.runtime.stages.byte_budget import share, weight_of
 from caneflow.runtime.stages.merge import END, Merge
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.streams import Arrivals, Departures
@@ -44,6 +45,19 @@ class Stage:
         self._awaited = [out for out in self.outputs.values() if out.plan.awaited]
         self._operator = operator
         self._merge = Merge(tuple(inputs))
+        self._budget: int | None = None  # bytes of one port that may wait for their turn; None: not bounded
+        self._held = dict.fromkeys(inputs, 0)  # bytes of those, where they are bounded
+
+    def bound(self, budget: int) -> None:
+        """Let samples that wait take no more than `budget` bytes, of all inputs; the oldest are dropped beyond."""
+        self._budget = share(budget, len(self.inputs))
+        for arrivals in self.inputs.values():
+            arrivals.budget = self._budget
+
+    @property
+    def held(self) -> int:
+        """What the samples that wait take, in bytes."""
+        return sum(self._held.values()) + sum(arrivals.ahead_held for arrivals in self.inputs.values())
 
     def offer(self, port: str, message: Sample, *, again: bool = False) -> None:
         """Take a decoded sample that arrived on `port`; `again`: it was asked for, and may have come before."""
@@ -97,6 +111,8 @@ class Stage:
         due = self._merge.pop()
         if due is not None:
             port, message = due
+            if self._budget is not None:
+                self._held[port] -= weight_of(message)
             return self._handled(port, self.inputs[port], message, now)
         if not self.finished and self._merge.ended:
             self.finished = True
@@ -182,6 +198,8 @@ class Stage:
             arrivals.leave_out(message, "late")
         else:
             self._merge.push(port, message)
+            if self._budget is not None:
+                self._held[port] += weight_of(message)
             self._keep_length(port, arrivals)
 
     def _handled(
@@ -209,9 +227,14 @@ class Stage:
         return port, message, departures.number(message)
 
     def _keep_length(self, port: str, arrivals: Arrivals) -> None:
-        length = arrivals.plan.length
-        while length is not None and self._merge.waiting(port) > length:
-            arrivals.leave_out(self._merge.drop_oldest(port), "dropped")
+        length, budget = arrivals.plan.length, self._budget
+        while (length is not None and self._merge.waiting(port) > length) or (
+            budget is not None and self._held[port] > budget and self._merge.waiting(port) > 1
+        ):
+            oldest = self._merge.drop_oldest(port)
+            if budget is not None:
+                self._held[port] -= weight_of(oldest)
+            arrivals.leave_out(oldest, "dropped")
             arrivals.counts.dropped += 1
 
     def _count_mark(self, port: str, arrivals: Arrivals) -> None:

@@ -8,13 +8,15 @@ from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, LeftOut, PortMark
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
+from caneflow.runtime.stages.byte_budget import WAITING, weight_of
 from caneflow.runtime.stages.merge import BEGIN, END
 
 log = logging.getLogger(__name__)
 
 NOTES_KEPT = 10_000  # per stream, until a live host has told them
-AHEAD_KEPT = 20_000  # samples of one stream that may wait for what is missing before them
+AHEAD_KEPT = 65_536  # samples of one stream that may wait for what is missing before them
 CAUSES_NAMED = 100  # per stream: a hostile writer must not fill the memory
+LONGEST_CAUSE = 300  # characters of one, likewise
 SILENCE = 1_000_000_000  # ns from one stamp of a stream to the next that are worth a line
 FAR_AHEAD = (
     1_000_000_000  # ns that a live stamp may lie ahead of its clock, which is known to some ms; sensors stamp the past
@@ -42,6 +44,10 @@ class Arrivals:
     handled_stamp: int = BEGIN  # ns, likewise
     handled_at: int | None = None  # ns, the host's clock, when the sample of that stamp was; a live host only
     mark: PortMark | None = None  # of the writer, waiting for its last sample to arrive
+    budget: int = WAITING  # bytes that those may take
+    ahead_held: int = 0  # bytes that they take
+    newest: int = -1  # seq of the last sample that is known to be sent, while some are missing
+    _ahead_first: int | None = None  # the smallest seq of those that wait
     _named: set[str] = field(default_factory=set)
     _silences: int = 0  # that were said
 
@@ -49,6 +55,12 @@ class Arrivals:
         """Count a sample that cannot be taken; name the cause once per kind of cause."""
         self.counts.refused += 1
         self._say_once(kind or str(cause), f"refused: {cause}")
+
+    def drop_unseen(self, count: int) -> None:
+        """Count samples that were dropped before they were looked at: more came than the node may hold."""
+        self.counts.received += count
+        self.counts.dropped += count
+        self._say_once("dropped", f"{count} samples dropped unseen: they came faster than the node takes them")
 
     def refuse_unreadable(self, error: MessageError) -> None:
         """Count a sample that could not be decoded: its number is not known, so it is not lost as well."""
@@ -90,11 +102,13 @@ class Arrivals:
         if message.stamp <= self.last_stamp or message.seq in self.ahead:
             self._refuse_old(message, again=again)
             return []
-        if self.patient and message.seq > self.expected + self.unreadable and len(self.ahead) < AHEAD_KEPT:
-            self.ahead[message.seq] = message
+        if not self.patient or message.seq <= self.expected + self.unreadable:
+            self._note_lost(message.seq)
+            return [self._next(message), *self._caught_up()]
+        self._let_wait(message)
+        if len(self.ahead) <= AHEAD_KEPT and self.ahead_held <= self.budget:
             return []
-        self._note_lost(message.seq)
-        return [self._next(message), *self._caught_up()]
+        return self.skip_to(self._ahead_first or 0)
 
     def is_simply_next(self, message: Sample) -> bool:
         """Whether `message` is as it should be, and nearly always is: next in number and time, with nothing missing.
@@ -117,6 +131,7 @@ class Arrivals:
         """Take the writer's word on how far it has come, if it is no older than the one that waits."""
         if self.mark is None or mark.watermark >= self.mark.watermark:
             self.mark = mark
+            self.newest = max(self.newest, mark.last_seq)
 
     def skip_to(self, seq: int) -> list[Sample]:
         """Take what is missing before `seq` as lost; the samples that waited for it."""
@@ -127,14 +142,16 @@ class Arrivals:
     @property
     def missing_before(self) -> int | None:
         """The seq before which samples are known to be missing."""
-        if self.ahead:
-            return min(self.ahead)
+        if self._ahead_first is not None:
+            return self._ahead_first
         return None if self.mark is None else self.mark.last_seq + 1
 
-    @property
-    def newest(self) -> int:
-        """The seq of the last sample that is known to be sent."""
-        return max(self.expected - 1, max(self.ahead, default=-1), -1 if self.mark is None else self.mark.last_seq)
+    def _let_wait(self, message: Sample) -> None:
+        seq = message.seq
+        self.ahead[seq] = message
+        self.ahead_held += weight_of(message)
+        self.newest = max(self.newest, seq)
+        self._ahead_first = seq if self._ahead_first is None else min(self._ahead_first, seq)
 
     def _refuse_old(self, message: Sample, *, again: bool) -> None:
         if again:
@@ -149,6 +166,8 @@ class Arrivals:
 
     def _next(self, message: Sample) -> Sample:
         # A smaller seq with a newer stamp is a writer that was restarted and counts anew.
+        if message.seq < self.expected:
+            self.newest = message.seq
         self._note_silence(message)
         self.expected, self.unreadable = message.seq + 1, 0
         self.last_stamp = message.stamp
@@ -158,7 +177,10 @@ class Arrivals:
         """The samples that waited and are next now."""
         found = []
         while (message := self.ahead.pop(self.expected, None)) is not None:
+            self.ahead_held -= weight_of(message)
             found.append(self._next(message))
+        if found:
+            self._ahead_first = min(self.ahead, default=None)
         return found
 
     def note_handled(self, message: Sample, now: int | None = None) -> None:
@@ -213,6 +235,7 @@ class Arrivals:
         log.warning("%s: nothing for %.2f s before seq %d%s", self.plan.key, silent / 1e9, message.seq, last)
 
     def _say_once(self, kind: str, text: str) -> None:
+        kind, text = kind[:LONGEST_CAUSE], text[:LONGEST_CAUSE]
         if kind not in self._named and len(self._named) < CAUSES_NAMED:
             self._named.add(kind)
             log.warning("%s: %s (counted from now on, not repeated)", self.plan.key, text)

@@ -6,6 +6,7 @@ from caneflow.messages import MessageError, Sample
 from caneflow.messages.control import InputCounts, PortMark, Progress
 from caneflow.runtime.plan import InputPlan
 from caneflow.runtime.program import Sink
+from caneflow.runtime.stages.byte_budget import share
 from caneflow.runtime.stages.merge import BEGIN, END
 from caneflow.runtime.stages.streams import Arrivals
 
@@ -20,6 +21,16 @@ class Tap:
         self._sink = sink
         self._watermarks = {port: BEGIN for port in inputs}
         self._payloads: dict[str, dict[int, bytes]] = {port: {} for port in inputs}  # of samples on their way, by seq
+
+    def bound(self, budget: int) -> None:
+        """Let samples that wait for missing ones take no more than `budget` bytes, of all inputs."""
+        for arrivals in self.inputs.values():
+            arrivals.budget = share(budget, len(self.inputs))
+
+    @property
+    def held(self) -> int:
+        """What the samples that wait take, in bytes: each is kept decoded and as it came."""
+        return sum(2 * arrivals.ahead_held for arrivals in self.inputs.values())
 
     def offer(self, port: str, message: Sample, payload: bytes, time: int, *, again: bool = False) -> None:
         """Take a decoded sample that arrived on `port` at `time` (ns); `again`: it was asked for."""
