@@ -34,6 +34,7 @@ from tests.test_stage import emitted, imu, stage
 
 MB = 10**6
 BARE = 80 * MB  # what a node takes that holds nothing
+SHARED_MEMORY = 16 * 2**20  # bytes: Zenoh's pool of a process that sends large samples
 
 
 def frame(stamp: int, scans: int = 1, bins: int = 96) -> RadarFrame:
@@ -49,8 +50,8 @@ def frame(stamp: int, scans: int = 1, bins: int = 96) -> RadarFrame:
 
 
 def test_all_budgets_of_a_node_together_leave_it_below_250_mb() -> None:
-    snapshot = SENT  # what was sent is in it
-    assert BARE + SENT + snapshot + WAITING + INBOX + CONTROL < 250 * MB
+    snapshot = 3 * SENT  # what was sent is in it; while it grows, it is there twice
+    assert BARE + SHARED_MEMORY + SENT + snapshot + WAITING + INBOX + CONTROL < 250 * MB
 
 
 @pytest.mark.parametrize(

@@ -418,7 +418,7 @@ class _OperatorNode(_ReaderNode):
         self.stage = Stage(plan.node, operator, plan.inputs, plan.outputs)
         super().__init__(plan, bus, self.stage)
         self.history: History = _history(plan)
-        # In a replay, where writers wait for it: bytes after which a snapshot confirms what was handled.
+        # Bytes after which a snapshot confirms what was handled: writers keep no more than twice as many for this node.
         self._snapshot_bytes = min(wire.budget for wire in plan.inputs.values()) // 2
         self._since_snapshot = 0  # bytes of samples that came
         self.keeper = SnapshotKeeper(snapshots, operator)
@@ -466,8 +466,7 @@ class _OperatorNode(_ReaderNode):
         if message is None:
             self.follow_up(arrived)
             return
-        if self.plan.replay:
-            self._since_snapshot += weight(arrived.payload)
+        self._since_snapshot += weight(arrived.payload)
         emitted = None if self.history.full else self.stage.handle_at_once(arrived.port, message, self.now())
         if emitted is None:
             self.take_message(arrived, message)

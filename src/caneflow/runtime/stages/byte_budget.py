@@ -9,7 +9,7 @@ import msgspec
 
 from caneflow.messages import Sample
 
-SENT = 24 * 2**20  # bytes of all outputs: samples that some reader has not confirmed yet
+SENT = 16 * 2**20  # bytes of all outputs: samples that some reader has not confirmed yet
 WAITING = 2 * SENT  # bytes of all inputs: decoded samples that wait for their turn, or for one that is missing
 INBOX = 2 * SENT  # bytes of all inputs: samples that the node has not looked at yet
 CONTROL = 8 * 2**20  # bytes of marks, requests and orders that the node of a replay has not looked at yet
