@@ -421,6 +421,7 @@ class _OperatorNode(_ReaderNode):
         # Bytes after which a snapshot confirms what was handled: writers keep no more than twice as many for this node.
         self._snapshot_bytes = min(wire.budget for wire in plan.inputs.values()) // 2
         self._since_snapshot = 0  # bytes of samples that came
+        self._keeps = True  # the last snapshot could be kept
         self.keeper = SnapshotKeeper(snapshots, operator)
         self.marked: Progress | None = None  # what readers that wait were told last
         self.confirmed: dict[str, int] = {}  # by input key what the last snapshot has handled
@@ -559,15 +560,20 @@ class _OperatorNode(_ReaderNode):
     def keep_snapshot(self) -> None:
         """Now and then: what a new process in this one's place needs to go on."""
         with self.lock:
-            due = time.monotonic() >= self._next_snapshot or self._since_snapshot >= self._snapshot_bytes
+            full = self._since_snapshot >= self._snapshot_bytes
+            due = time.monotonic() >= self._next_snapshot or (full and self._keeps)
             if self._broken is not None or not due or self._next_snapshot == math.inf:
                 return
-            self._since_snapshot = 0
+            came = self._since_snapshot
             self._next_snapshot = math.inf  # until this one is kept
             handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
             fresh = handled != self.confirmed
             snapshot = self.keeper.taken(self.stage.state(), self.history.kept()) if fresh else None
-        if not fresh or self.is_kept(snapshot):  # live without the lock: samples do not wait for the disk
+        self._keeps = not fresh or self.is_kept(snapshot)  # live without the lock: samples do not wait for the disk
+        if self._keeps:
+            with self.lock:
+                self._since_snapshot -= came
+        if self._keeps or full:  # else the writers of a replay would wait for a snapshot without end
             self.confirmed = handled
         self._next_snapshot = time.monotonic() + self._snapshot_period
 
@@ -575,8 +581,9 @@ class _OperatorNode(_ReaderNode):
         """Keep a snapshot, or None for a state that cannot be kept; whether writers may forget what it has handled.
 
         They may when a process in this one's place would not ask for it. So while no snapshot can be written they keep
-        what came since the last one, up to the bound of their histories. A replay without any snapshot begins again
-        with its first sample; a live operator with what is new, since old samples would only make it late.
+        what came since the last one, up to the bound of their histories: beyond it a replay goes on, and would end with
+        status 1 if this process were killed. A replay without any snapshot begins again with its first sample; a live
+        operator with what is new, since old samples would only make it late.
         """
         if snapshot is not None:
             return self.keeper.keep(snapshot)
