@@ -45,7 +45,7 @@ THREADS = {  # read once by Zenoh, when the first session of a process opens
 }
 # What Zenoh prints unless RUST_LOG says. Where access control has refused a declaration, Zenoh prints an error for its
 # end ("Unknown token id=2"), on the standard output; that one is expected.
-LOGGED = "error,zenoh::net::routing::hat=off,zenoh::net::routing::dispatcher=off"
+LOGGED = "error,zenoh::api::session=off,zenoh::net::routing::hat=off,zenoh::net::routing::dispatcher=off"
 RETRY = {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2}
 SENT_AT_BYTES = 8  # of a sample's attachment: ns, little-endian
 UNIX = "unixsock-stream"  # Zenoh's word for Unix sockets
