@@ -11,7 +11,7 @@ import caneflow  # noqa: F401 - first: processes that are started from here, the
 
 # A run that nobody changed must not turn red: what only another draw finds is found where it is looked for, and a busy
 # machine is no fault of the test.
-LOADED = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
-settings.register_profile("same", derandomize=True, **LOADED)
-settings.register_profile("others", derandomize=False, **LOADED)
+loaded = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("same", loaded, derandomize=True)
+settings.register_profile("others", loaded, derandomize=False)
 settings.load_profile(os.environ.get("CANEFLOW_EXAMPLES", "same"))
