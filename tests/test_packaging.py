@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import re
 import tomllib
 from pathlib import Path
 
@@ -47,3 +48,19 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     copy.write_text(UNIT.read_text().replace("/opt/caneflow/bin/caneflow", "/bin/true"))
     done = subprocess.run(["systemd-analyze", "verify", copy], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_each_promise_of_the_readme_names_tests_that_there_are() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    promises = readme.partition("## What it promises")[2].partition("\n## ")[0]
+    rows = [line for line in promises.splitlines() if line.startswith("| **")]
+    there = {
+        name
+        for path in (ROOT / "tests").glob("test_*.py")
+        for name in re.findall(r"^def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert len(rows) > 5
+    for row in rows:
+        named = re.findall(r"`(test_\w+)`", row)
+        assert named, row
+        assert set(named) <= there, row
