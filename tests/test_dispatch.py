@@ -193,6 +193,19 @@ def test_another_platform_is_named_and_compared_within_the_stated_tolerance(
     assert all(any(name in line or "kernels" in line for line in named) for name in other)
 
 
+def test_a_recording_that_does_not_say_is_compared_within_the_stated_tolerance(
+    recorded: tuple[Path, Path], tmp_path: Path, unpinned: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flow, recording = recorded
+    with Recording(recording) as source:
+        here = source.platform
+    assert here is not None
+    unsaid = msgspec.structs.replace(here, machine="\x1b")  # which nobody believes
+    status, about = verified(flow, copied(recording, tmp_path / "old.mcap", unsaid, 1e-7, monkeypatch), unpinned)
+    assert status == 0
+    assert about["platform_differences"] == ["the recording does not say on what it was computed"]
+
+
 @pytest.mark.parametrize(
     "text", ["", "{", '{"machine": "x"}', json.dumps({**msgspec.to_builtins(Platform.here()), "numpy": "2\x1b[2J"})]
 )

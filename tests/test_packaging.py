@@ -1,8 +1,8 @@
 """The house: every room is installed, and the settings of the tools agree."""
 
+import re
 import shutil
 import subprocess
-import re
 import tomllib
 from pathlib import Path
 

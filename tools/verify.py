@@ -32,8 +32,8 @@ def command(
     """Run a recording again, in this process, and compare each operator's output with the recorded one.
 
     What a recorded live run did not handle in time is left out, as it was then. A recording that was computed on
-    another platform (architecture, C library, numpy, scipy) is compared within a tolerance, after a line that names
-    the differences. Exit status 0: every stream is as
+    another platform (architecture, C library, numpy, scipy), or does not say on which, is compared within a tolerance,
+    after a line that names the differences. Exit status 0: every stream is as
     it was recorded. 1: one is not; its first difference is named. 2: the file or the recording cannot be used.
 
     Example: caneflow verify dataflow.yaml field.mcap --tolerance 1e-9
@@ -45,7 +45,7 @@ def command(
         print(json.dumps({**about, "platform_differences": verification.differences, "streams": streams}, indent=2))
     else:
         if verification.differences:
-            print(f"another platform: {'; '.join(verification.differences)}")
+            print(f"perhaps another platform: {'; '.join(verification.differences)}")
             print(f"numbers may differ by {verification.tolerance:g}, each in its own SI unit")
         for verdict in verification.verdicts:
             print(printable(f"{verdict.stream}: {_said(verdict)}"))

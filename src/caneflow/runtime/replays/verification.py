@@ -91,7 +91,10 @@ def verify(graph: Graph, path: Path, *, tolerance: float | None = None) -> Verif
             raise DataflowError(
                 f"{path}: holds no output of {graph.path} ({recording.named()}); record a run with --record"
             )
-        differences = recording.platform.differences(Platform.here()) if recording.platform else []
+        there = recording.platform
+        differences = (
+            there.differences(Platform.here()) if there else ["the recording does not say on what it was computed"]
+        )
         if tolerance is None:
             tolerance = ACROSS_PLATFORMS if differences else 0.0
         comparison = _Comparison(recording, list(outputs), tolerance)
