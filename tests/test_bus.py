@@ -9,9 +9,9 @@ import zenoh
 
 from caneflow.messages import control_key, encode
 from caneflow.messages.control import Again, PortMark, Progress
-from caneflow.runtime.hosts.bus import AGAIN, Arrived, Bus, Event, Started
+from caneflow.runtime.hosts.bus import AGAIN, Arrived, Asked, Bus, Event, Started
 from caneflow.runtime.hosts.links import Ports, open_session
-from caneflow.runtime.plan import InputPlan, Links, NodePlan
+from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
 from tests.flows import wait_for
 
 KEY = "f/imu/imu"
@@ -114,3 +114,21 @@ def test_a_sink_is_not_woken_for_marks_that_only_operators_wait_for() -> None:
         marks = writer.declare_publisher(control_key("f", "marks", "imu"))
         wait_for(lambda: progress.matching_status.matching, "the subscription to arrive")  # type: ignore[attr-defined]  # the stub says bool
         assert not marks.matching_status.matching  # type: ignore[attr-defined]  # the stub says bool
+
+
+@pytest.mark.parametrize("asked", [b"9" * 5000, b"\xff\xfe", b"-1", b"", "\u0661".encode()])
+def test_a_request_that_names_no_number_is_left_unanswered(asked: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    ports = Ports()
+    endpoint = ports.endpoint()
+    outputs = {"imu": OutputPlan(key=KEY, schema="caneflow.Imu/1")}
+    plan = NodePlan(flow="f", node="imu", outputs=outputs, links=Links(listen=(endpoint,)))
+    with Bus(plan) as bus, open_session(connect=[endpoint]) as reader:
+        key = control_key("f", "history", "imu", "imu")
+        querier = reader.declare_querier(key, timeout=30.0)
+        wait_for(lambda: querier.matching_status.matching, "the link")  # type: ignore[attr-defined]  # the stub says bool
+        assert list(querier.get(payload=asked)) == []
+        querier.get(zenoh.handlers.Callback(lambda _: None, indirect=False), payload=b"7")
+        (event,) = bus.events(30)
+        assert isinstance(event, Asked)
+        assert event.first == 7
+    ports.release()

@@ -23,7 +23,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.inbox import Inbox
 from caneflow.runtime.hosts.links import KnownThreads, open_session, sending_now, sent_at
 from caneflow.runtime.plan import InputPlan, NodePlan
-from caneflow.runtime.stages.byte_budget import CONTROL, INBOX, PER_SAMPLE, share
+from caneflow.runtime.stages.byte_budget import CONTROL, INBOX, PER_REQUEST, PER_SAMPLE, share
 
 log = logging.getLogger(__name__)
 
@@ -464,8 +464,10 @@ def _weight(event: Event) -> int:
             return 0
         case Noted():
             return PER_SAMPLE + len(event.payload)
+        case Asked():
+            return PER_REQUEST
         case Questioned():
-            return PER_SAMPLE + len(event.question)
+            return PER_REQUEST + len(event.question)
         case _:
             return PER_SAMPLE
 

@@ -14,6 +14,7 @@ WAITING = 2 * SENT  # bytes of all inputs: decoded samples that wait for their t
 INBOX = 2 * SENT  # bytes of all inputs: samples that the node has not looked at yet
 CONTROL = 8 * 2**20  # bytes of marks, requests and orders that the node of a replay has not looked at yet
 PER_SAMPLE = 512  # bytes that a sample takes beside its payload
+PER_REQUEST = 10_000  # bytes that a request that waits for its answer takes, with what Zenoh keeps for it (measured)
 PER_MESSAGE = 768  # bytes that a decoded sample takes beside its arrays
 SMALL = (int, float, bool)  # types of fields that PER_MESSAGE holds
 
