@@ -93,8 +93,8 @@ def test_in_a_replay_no_mark_or_answer_overtakes_the_samples_that_were_sent_befo
         say(writer, 1)
         assert came == []
         free.set()
-        wait_for(lambda: len(came) == 6, "everything to be taken")
-    assert came == ["Arrived", "Arrived", "Marked", "ArrivedAgain", "Answered", "Arrived"]
+        wait_for(lambda: len(came) == 7, "everything to be taken")
+    assert came == ["Arrived", "Arrived", "Marked", "ArrivedAgain", "Answered", "AskEnded", "Arrived"]
 
 
 @pytest.mark.parametrize("replay", [False, True])

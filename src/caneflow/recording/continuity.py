@@ -1,5 +1,6 @@
 """How the samples of one stream follow each other: gaps, numbers that begin again, wrong stamps."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import msgspec
@@ -31,8 +32,20 @@ class Continuity:
     last_seq: int = -1
     last_stamp: int = -1
 
+    def take_all(self, samples: Iterable[tuple[int, int, bytes]]) -> None:
+        """Note the next samples: number, stamp (ns) that it is filed under, payload."""
+        for seq, stamp, payload in samples:
+            if seq == self.last_seq + 1 and stamp > self.last_stamp == self.largest:  # as nearly all are
+                try:
+                    if _head(payload).stamp == stamp:
+                        self.last_seq, self.last_stamp, self.largest = seq, stamp, stamp
+                        continue
+                except msgspec.DecodeError:
+                    pass
+            self.take(seq, stamp, payload)
+
     def take(self, seq: int, stamp: int, payload: bytes) -> None:
-        """Note the next sample, which is filed under `stamp` (ns)."""
+        """Note the next sample."""
         if seq <= self.last_seq:
             self.restarts += 1
         elif self.last_seq >= 0:

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, takewhile
 from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
@@ -27,6 +27,7 @@ from caneflow.recording.layout import (
     MAGIC,
     Block,
     Content,
+    Entry,
     Layout,
     TooMuchError,
     content_of,
@@ -44,7 +45,7 @@ COUNTED = (
 )  # bytes of a block that is worth adding up: smaller ones of all streams there can be are as much as that
 MOST_PASSES = 16  # through a file, by streams that lie far apart in time
 GLANCE_BLOCKS = 64  # a minute of a live recording
-GLANCE_BYTES = 2**24  # unpacked: a minute of a cane
+GLANCE_BYTES = 2**23  # unpacked: most of a minute of a cane
 MOST_NAMED = 50  # streams in an error message
 EXPECTED = "a recording is an MCAP file as `caneflow run --record` writes it"
 
@@ -192,11 +193,11 @@ class Recording:
             content = None
             for key in block.topics & left.keys():
                 content = content or self._content(block)
-                for stamp, seq, _, begin, finish in content.messages[key]:
-                    if end_ns is not None and stamp >= end_ns:
-                        del left[key]
-                        break
-                    left[key].take(seq, stamp, content.data[begin:finish])
+                entries, data = content.messages[key], content.data
+                within = entries if end_ns is None else _before(end_ns, entries)
+                left[key].take_all((seq, stamp, data[begin:finish]) for stamp, seq, _, begin, finish in within)
+                if len(within) < len(entries):
+                    del left[key]
         return found
 
     def _spread(self) -> list[Block]:
@@ -359,6 +360,11 @@ def _sound_layout(path: Path, file: BinaryIO) -> Layout:
     if layout.damaged:
         raise RecordingError(_damaged(path, layout.damaged[0]))
     return layout
+
+
+def _before(end: int, entries: list[Entry]) -> list[Entry]:
+    """Those before the first whose stamp is at or after `end`."""
+    return list(takewhile(lambda entry: entry[0] < end, entries))
 
 
 def _by_topic(layout: Layout) -> dict[str, list[Block]]:

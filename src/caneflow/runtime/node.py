@@ -26,6 +26,7 @@ from caneflow.runtime.hosts.bus import (
     Answered,
     Arrived,
     Asked,
+    AskEnded,
     Broken,
     Bus,
     Confirmed,
@@ -181,6 +182,7 @@ class _ReaderNode(ABC):
         # Each writer is asked at the start what it has sent so far, until it answers: a node that is started anew may
         # have missed its last word, and the link to the writer may not be there yet.
         self._unanswered = dict.fromkeys(plan.inputs, 0.0)  # s, monotonic: when to ask next
+        self._asking: set[str] = set()  # ports whose writer is being asked: what it answers may wait to be looked at
         self._dropped = dict.fromkeys(plan.inputs, 0)  # unseen, as was counted
         reader.bound(WAITING)
         self.lock = threading.RLock()  # over all of this node's state
@@ -291,6 +293,8 @@ class _ReaderNode(ABC):
                 self.take_mark(event.port, event.mark)
                 if event.first > self.reader.inputs[event.port].expected:
                     self.skip_to(event.port, event.first)  # the writer does not have what lies before it any more
+            case AskEnded():
+                self._asking.discard(event.port)
             case Marked():
                 self.take_mark(event.port, event.mark)
             case Noted() if isinstance(self.reader, Tap):
@@ -353,8 +357,7 @@ class _ReaderNode(ABC):
         """Ask for samples that were sent and have not come; after long enough, go on without them."""
         now = time.monotonic()
         for port, ask_at in self._unanswered.items():
-            if now >= ask_at:
-                self.bus.ask_again(port, self.reader.inputs[port].expected)
+            if now >= ask_at and self.ask(port):
                 self._unanswered[port] = now + ASK_PERIOD
         for port, arrivals in self.reader.inputs.items():
             before = arrivals.missing_before
@@ -369,9 +372,16 @@ class _ReaderNode(ABC):
                 self._missing[port] = missing
             if now - missing.since > self._patience(arrivals.newest > missing.newest):
                 self.skip_to(port, before)
-            elif now >= missing.ask_at:
-                self.bus.ask_again(port, arrivals.expected)
+            elif now >= missing.ask_at and self.ask(port):
                 missing.ask_at = now + ASK_PERIOD
+
+    def ask(self, port: str) -> bool:
+        """Ask the writer of `port` for what has not come, unless it is being asked already; whether it is asked now."""
+        if port in self._asking:
+            return False
+        self._asking.add(port)
+        self.bus.ask_again(port, self.reader.inputs[port].expected)
+        return True
 
     def begin_at(self, port: str, seq: int) -> None:  # noqa: B027 - an operator goes on from its snapshot
         """Hear that the writer has no sample before `seq` any more."""

@@ -64,6 +64,12 @@ class Answered(msgspec.Struct, frozen=True, gc=False):
     mark: PortMark
 
 
+class AskEnded(msgspec.Struct, frozen=True, gc=False):
+    """A request of this node's for samples is over: all that came of it was put before this."""
+
+    port: str
+
+
 class Asked(msgspec.Struct, frozen=True, gc=False):
     """A reader asks for samples of an output port again."""
 
@@ -122,7 +128,19 @@ class Stopped(msgspec.Struct, frozen=True, gc=False):
 
 Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
 Event: TypeAlias = (
-    Arrived | Answered | Asked | Questioned | Confirmed | Noted | Marked | Timed | Broken | Started | Opened | Stopped
+    Arrived
+    | Answered
+    | AskEnded
+    | Asked
+    | Questioned
+    | Confirmed
+    | Noted
+    | Marked
+    | Timed
+    | Broken
+    | Started
+    | Opened
+    | Stopped
 )
 
 
@@ -250,10 +268,14 @@ class Bus:
         return not self._inbox.empty()
 
     def ask_again(self, port: str, first: int) -> None:
-        """Ask the writer of an input for its samples from seq `first` on; they come as events, then Answered."""
+        """Ask the writer of an input for its samples from seq `first` on.
+
+        They come as events, then Answered; at the end, also when nobody answers, AskEnded.
+        """
         wire = self._plan.inputs[port]
         key = control_key(self._plan.flow, "history", wire.writer, wire.key.rpartition("/")[2])
-        handler = zenoh.handlers.Callback(self._on_reply(port), indirect=False)
+        take = self._inbox.put if self._lanes.get(port) is None else self._lanes[port].put
+        handler = zenoh.handlers.Callback(self._on_reply(port, take), partial(take, AskEnded(port)), indirect=False)
         # Without this Zenoh keeps only the last of several replies under one key.
         every = zenoh.ConsolidationMode.NONE
         self._session.get(key, handler, payload=str(first), timeout=ANSWER_TIMEOUT, consolidation=every)
@@ -395,9 +417,7 @@ class Bus:
         lane = self._lanes.get(port)
         return self._bring if lane is None else lane.put
 
-    def _on_reply(self, port: str) -> Callable[[zenoh.Reply], None]:
-        take = self._inbox.put if self._lanes.get(port) is None else self._lanes[port].put
-
+    def _on_reply(self, port: str, take: Callable[[Event], None]) -> Callable[[zenoh.Reply], None]:
         def put(reply: zenoh.Reply) -> None:
             if reply.ok is None:
                 return
@@ -460,7 +480,7 @@ def _weight(event: Event) -> int:
     if kind is Arrived:
         return PER_SAMPLE + len(event.payload) + len(event.schema)  # type: ignore[union-attr]  # the kind says it
     match event:
-        case Started() | Stopped() | Broken():
+        case Started() | Stopped() | Broken() | AskEnded():
             return 0
         case Noted():
             return PER_SAMPLE + len(event.payload)
