@@ -127,8 +127,10 @@ def test_a_request_that_names_no_number_is_left_unanswered(asked: bytes, caplog:
         querier = reader.declare_querier(key, timeout=30.0)
         wait_for(lambda: querier.matching_status.matching, "the link")  # type: ignore[attr-defined]  # the stub says bool
         assert list(querier.get(payload=asked)) == []
-        querier.get(zenoh.handlers.Callback(lambda _: None, indirect=False), payload=b"7")
+        replies = querier.get(payload=b"7")
         (event,) = bus.events(30)
         assert isinstance(event, Asked)
         assert event.first == 7
+        bus.answer(event, [], Again(0, PortMark(-1, -1)))
+        assert len(list(replies)) == 1
     ports.release()
