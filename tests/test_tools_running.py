@@ -81,13 +81,13 @@ flow: {flow}
 links: {links}
 nodes:
   source: {{run: ./source.py}}
-  gaps:
+  ticks:
     run: ./join.py
-    inputs: {{a: source/tick, b: {{from: source/gaps, max_lag_ms: 50}}}}
+    inputs: {{a: source/tick, b: {{from: source/other, max_lag_ms: 50}}}}
   full: {{run: ./join.py, inputs: {{a: {{from: source/full, queue: fifo 3}}, b: source/other}}}}
   late: {{run: ./join.py, inputs: {{a: source/prompt, b: {{from: source/tardy, max_lag_ms: 100}}}}}}
-  bad: {{run: ./join.py, inputs: {{a: source/bad, b: source/other}}}}
-results: [gaps/imu, full/imu, late/imu, bad/imu]
+  bad: {{run: ./join.py, inputs: {{a: source/bad, b: source/gaps}}}}
+results: [ticks/imu, full/imu, late/imu, bad/imu]
 """
 
 
@@ -175,28 +175,27 @@ def put(here: Attached, port: str, seqs: range, *, first: int = SECOND) -> None:
 
 def test_losses_are_counted_exactly_where_they_happen(flow: str) -> None:
     with attached(flow) as here:
-        ahead = time.time_ns() + 100 * SECOND  # of `tick`, so that nothing of it is late
-        put(here, "gaps", range(3), first=ahead)
+        put(here, "gaps", range(3))
         for _ in range(4):
             here.session.put(sample_key(flow, "source", "gaps"), b"\xc1 no sample")
-        put(here, "gaps", range(7, 9), first=ahead)  # 3 to 6 are the four that could not be read
-        put(here, "gaps", range(14, 16), first=ahead)  # 9 to 13 never come
+        put(here, "gaps", range(7, 9))  # 3 to 6 are the four that could not be read
+        put(here, "gaps", range(14, 16))  # 9 to 13 never come
         put(here, "full", range(10))  # wait for `other`, of which nothing comes
         put(here, "prompt", range(3), first=2 * SECOND)
         wait_for(lambda: edge_of(here.status(), "late.a").handled == 3, "the three that did not wait for ever")
         put(here, "tardy", range(6))  # all before the three
         expected = {
-            "gaps.a": {},
-            "gaps.b": {"wire": 5, "decode": 4},
+            "ticks.a": {},
+            "bad.b": {"wire": 5, "decode": 4},
             "full.a": {"queue": 7},
             "late.b": {"late": 6},
             "bad.a": {"sender": 2},
         }
-        wait_for(lambda: lost(here.status(), "gaps.b").get("wire"), "what is given up after a second")
+        wait_for(lambda: lost(here.status(), "bad.b").get("wire"), "what is given up after a second")
         wait_for(lambda: lost(here.status(), "late.b").get("late") == 6, "the six that come too late")
         status = here.status()
         assert {reader: lost(status, reader) for reader in expected} == expected
-        gaps = edge_of(here.status(), "gaps.b")
+        gaps = edge_of(here.status(), "bad.b")
         assert (gaps.received, gaps.decode + gaps.handled + gaps.waiting + gaps.late) == (11, 11)
         assert edge_of(here.status(), "full.a").waiting == 3
         assert edge_of(here.status(), "bad.a").sent == 3
@@ -205,18 +204,18 @@ def test_losses_are_counted_exactly_where_they_happen(flow: str) -> None:
 def test_status_as_json(caneflow: Callable[..., Run], either_flow: str) -> None:
     flow = either_flow
     with attached(flow) as here:  # rates take two counts
-        wait_for(lambda: edge_of(here.status(), "gaps.a").rate, "a rate")
+        wait_for(lambda: edge_of(here.status(), "ticks.a").rate, "a rate")
         wait_for(lambda: here.status().nodes[0].rates["tick"], "the writer's")
     status, out, err = caneflow("status", flow, "--json")
     assert (status, err) == (0, "")
     about = json.loads(out)
     assert (about["flow"], about["replay"]) == (flow, False)
-    assert set(about["nodes"]) == {"source", "gaps", "full", "late", "bad", "recorder"}
+    assert set(about["nodes"]) == {"source", "ticks", "full", "late", "bad", "recorder"}
     source = about["nodes"]["source"]
     assert source["state"] == "ready"
     assert source["memory"] > 10_000_000
     assert 20 < source["rates"]["tick"] < 51
-    edge = next(edge for edge in about["edges"] if edge["reader"] == "gaps.a")
+    edge = next(edge for edge in about["edges"] if edge["reader"] == "ticks.a")
     assert edge["writer"] == "source/tick"
     assert edge["schema"] == "caneflow.Imu/1"
     assert 20 < edge["rate"] < 51
@@ -230,14 +229,14 @@ def test_status_for_people(caneflow: Callable[..., Run], flow: str) -> None:
     assert status == 0
     assert out.startswith(f"{flow}: live, on ")
     rows = {" ".join(line.split()[:3]): line for line in out.splitlines() if " > " in line}
-    assert set(rows) >= {"source/tick > gaps.a", "source/bad > bad.a"}
+    assert set(rows) >= {"source/tick > ticks.a", "source/bad > bad.a"}
     assert re.search(r"^source +ready +\d+ ", out, re.MULTILINE)
 
 
 def test_hz_of_chosen_streams(caneflow: Callable[..., Run], flow: str) -> None:
-    status, out, _ = caneflow("hz", flow, "source/tick", "gaps/imu", "--seconds", "1", "--json")
+    status, out, _ = caneflow("hz", flow, "source/tick", "ticks/imu", "--seconds", "1", "--json")
     figures = json.loads(out)
-    assert (status, set(figures)) == (0, {"source/tick", "gaps/imu"})
+    assert (status, set(figures)) == (0, {"source/tick", "ticks/imu"})
     tick = figures["source/tick"]
     assert 10 < tick["count"] <= 51
     assert tick["shortest"] <= 1 / tick["rate"] <= tick["longest"]
@@ -324,14 +323,14 @@ def test_the_doctor_of_a_flow_that_is_well(caneflow: Callable[..., Run], either_
     found = json.loads(out)
     assert (status, err) == (0, ""), [finding for finding in found if finding["state"] == "bad"]
     links = {finding["node"]: finding["text"] for finding in found if "linked to" in finding["text"]}
-    assert set(links) == {"source", "gaps", "full", "late", "bad", "recorder"}
+    assert set(links) == {"source", "ticks", "full", "late", "bad", "recorder"}
     assert re.fullmatch(r"listens on (port|socket) \d+; linked to the launcher", links["source"])
     assert links["full"].endswith("; linked to the launcher, source")
 
 
 def test_the_doctor_names_a_node_that_hangs(caneflow: Callable[..., Run], flow: str) -> None:
     with attached(flow) as here:
-        victim = next(node for node in here.status().nodes if node.node == "gaps")
+        victim = next(node for node in here.status().nodes if node.node == "ticks")
         os.kill(victim.pid, signal.SIGSTOP)
         try:
             wait_for(lambda: silence(here.status().nodes[1]) > 3.5, "three seconds of silence")
@@ -339,7 +338,7 @@ def test_the_doctor_names_a_node_that_hangs(caneflow: Callable[..., Run], flow: 
         finally:
             os.kill(victim.pid, signal.SIGCONT)
         assert status == 1
-        assert re.search(rf"^gaps: bad  has said nothing for \d s, pid {victim.pid} is there", out, re.MULTILINE)
+        assert re.search(rf"^ticks: bad  has said nothing for \d s, pid {victim.pid} is there", out, re.MULTILINE)
         assert re.search(r"^ +try  is it stopped, or in a long computation\?", out, re.MULTILINE)
         wait_for(lambda: (here.status().nodes[1].counted or 9) < 2, "its counters")
 
