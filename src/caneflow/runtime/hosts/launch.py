@@ -619,10 +619,15 @@ class Launcher:
         return self._leads and all(node.handled == END or node.missing for node in self._nodes.values())
 
     def _stop(self) -> None:
-        """End sources and operators, then the sinks, which take what was still on its way."""
+        """End the sources, then the operators, then the sinks: each still takes what was on its way.
+
+        Else a recorder may hear a sample that an operator, which ended sooner, has neither handled nor left out.
+        """
+        sources = [name for name, node in self._nodes.items() if not node.plan.inputs]
         sinks = [name for name, node in self._nodes.items() if node.plan.inputs and not node.plan.outputs]
-        others = [name for name in self._nodes if name not in sinks]
-        killed = self._processes.end(others, STOP_PATIENCE) + self._processes.end(sinks, STOP_PATIENCE - 0.5)
+        operators = [name for name in self._nodes if name not in (*sources, *sinks)]
+        killed = self._processes.end(sources, operators, patience=STOP_PATIENCE)
+        killed += self._processes.end(sinks, patience=STOP_PATIENCE - 0.5)
         for name in killed:
             self._report(name, f"did not end within {STOP_PATIENCE:g} s; killed")
             if self._nodes[name].spare:
