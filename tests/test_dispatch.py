@@ -81,6 +81,13 @@ def test_the_tunable_changes_the_mathematics_and_is_what_pins_them(unpinned: dic
     assert said(program, unpinned) != said(program, pinned)
 
 
+def test_there_is_no_third_start(unpinned: dict[str, str]) -> None:
+    program = "import os\nfrom caneflow import dispatch\ndispatch.restart_with_pinned_mathematics()\n"
+    program += "print(dispatch.RESTARTED in os.environ)"
+    assert said(program, {**unpinned, dispatch.RESTARTED: "1"}) == "False", "nor does the mark go on to others"
+    assert said(program, unpinned) == "False"
+
+
 def test_tunables_of_the_user_stay(unpinned: dict[str, str]) -> None:
     ours = ",".join(dispatch.NO_FUSED)
     together = dispatch._pinned_tunables
@@ -123,6 +130,7 @@ def test_a_recording_says_on_what_it_was_computed(recorded: tuple[Path, Path]) -
     "other",
     [
         {"NPY_DISABLE_CPU_FEATURES": "X86_V3"},
+        {"NPY_ENABLE_CPU_FEATURES": "X86_V3"},
         {"OPENBLAS_CORETYPE": "Prescott"},
         {"OPENBLAS_CORETYPE": "Haswell"},
         {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-AVX,-FMA"},

@@ -36,6 +36,7 @@ BLAS_CORES = {"x86_64": "Nehalem", "aarch64": "ARMV8"}
 
 # glibc has its mathematics (sin, exp, pow ...) with and without fused multiply-add on x86-64. "_Usable": before 2.33.
 TUNABLE = "glibc.cpu.hwcaps"
+RESTARTED = "CANEFLOW_RESTARTED"  # set in the environment for the second start: there is no third
 NO_FUSED = ("-FMA", "-FMA4", "-FMA_Usable", "-FMA4_Usable")
 
 
@@ -45,6 +46,7 @@ def pin() -> None:
         os.environ.setdefault(variable, "1")
     machine = os.uname().machine
     features = [*os.environ.get("NPY_DISABLE_CPU_FEATURES", "").replace(",", " ").split(), *_numpy_features(machine)]
+    os.environ.pop("NPY_ENABLE_CPU_FEATURES", None)  # numpy cannot be imported with both
     if features:
         os.environ["NPY_DISABLE_CPU_FEATURES"] = " ".join(dict.fromkeys(features))
     if machine in BLAS_CORES:
@@ -58,11 +60,15 @@ def restart_with_pinned_mathematics() -> None:
 
     The process stays the same, its interpreter is a new one: to be called before anything else is done.
     """
+    restarted = (
+        os.environ.pop(RESTARTED, None) is not None
+    )  # and to no avail: glibc hides tunables from privileged ones
     begun_with = _tunables_at_start()
-    if not _has_fused_mathematics() or begun_with is None or _pinned_tunables(begun_with) == begun_with:
+    if restarted or not _has_fused_mathematics() or begun_with is None or _pinned_tunables(begun_with) == begun_with:
         return
     if sys.executable:  # not inside another program
-        os.execv(sys.executable, sys.orig_argv)  # noqa: S606 - the same program again, and no shell
+        os.environ[RESTARTED] = "1"
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - the same program again, and no shell
 
 
 def pinned() -> tuple[str, ...]:
