@@ -233,7 +233,8 @@ def test_status_for_people(caneflow: Callable[..., Run], flow: str) -> None:
     assert re.search(r"^source +ready +\d+ ", out, re.MULTILINE)
 
 
-def test_hz_of_chosen_streams(caneflow: Callable[..., Run], flow: str) -> None:
+def test_hz_of_chosen_streams(caneflow: Callable[..., Run], either_flow: str) -> None:
+    flow = either_flow
     status, out, _ = caneflow("hz", flow, "source/tick", "ticks/imu", "--seconds", "1", "--json")
     figures = json.loads(out)
     assert (status, set(figures)) == (0, {"source/tick", "ticks/imu"})
@@ -292,7 +293,8 @@ def test_echo_that_hears_nothing_says_what_to_try(caneflow: Callable[..., Run], 
     assert err == f"caneflow echo: nothing came of full/imu in 0.2 s; `caneflow status {flow}` shows why\n"
 
 
-def test_top(caneflow: Callable[..., Run], flow: str) -> None:
+def test_top(caneflow: Callable[..., Run], either_flow: str) -> None:
+    flow = either_flow
     looks = [json.loads(line) for line in caneflow("top", flow, "--json", "--count", 2, "--every", 0.2)[1].splitlines()]
     assert len(looks) == 2
     assert looks[1]["memory"] == sum(node["memory"] for node in looks[1]["nodes"].values())

@@ -36,8 +36,8 @@ BLAS_CORES = {"x86_64": "Nehalem", "aarch64": "ARMV8"}
 
 # glibc has its mathematics (sin, exp, pow ...) with and without fused multiply-add on x86-64. "_Usable": before 2.33.
 TUNABLE = "glibc.cpu.hwcaps"
-RESTARTED = "CANEFLOW_RESTARTED"  # set in the environment for the second start: there is no third
 NO_FUSED = ("-FMA", "-FMA4", "-FMA_Usable", "-FMA4_Usable")
+RESTARTED = "CANEFLOW_RESTARTED"  # set in the environment for the second start: there is no third
 
 
 def pin() -> None:
