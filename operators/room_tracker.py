@@ -6,8 +6,8 @@ in   imu      : Imu             its orientation tells which way the person faces
 in   cane     : Pose            the person's own dead reckoning, whose drift the sensors bound; may be left out
 out  pose     : Pose            one per 50 ms, at the first sample of any input that is due
 
-`method` of a pose says more than the estimator's name: ` static_or_lost` when no sensor sees anything move or the
-person is felt to stand, and ` without west` when the sensor `west` has fallen silent.
+`status` of a pose says on what it rests: `static_or_lost` when no sensor sees anything move or the person is felt to
+stand, `without:west` when the sensor `west` has fallen silent; it is absent when all is well.
 """
 
 import math
@@ -147,18 +147,15 @@ class RoomTrackerOperator(Operator):
             velocity=(u, v, 0.0),
             orientation=self._facing or from_yaw(self._course),
             covariance=covariance,
-            method=self._described(stamp),
+            method=self._settings.method,
+            status=self._status(stamp),
         )
 
-    def _described(self, stamp: int) -> str:
-        """The method, and what the pose has to do without."""
-        silent = [sensor for sensor in self._heard_ns if self._is_silent(sensor, stamp)]
-        parts: list[str] = [self._settings.method]
-        if not self._tracker.moving:
-            parts.append("static_or_lost")
-        if silent:
-            parts.append(f"without {','.join(silent)}")
-        return " ".join(parts)
+    def _status(self, stamp: int) -> str | None:
+        """What the pose has to do without; None when all is well."""
+        words = [] if self._tracker.moving else ["static_or_lost"]
+        words += [f"without:{sensor}" for sensor in self._heard_ns if self._is_silent(sensor, stamp)]
+        return " ".join(words) or None
 
     def _is_silent(self, sensor: str, stamp: int) -> bool:
         assert self._begin_ns is not None

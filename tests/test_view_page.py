@@ -23,7 +23,7 @@ from caneflow.viewing.live import LiveStreams
 
 pytest.importorskip("playwright", reason="playwright is not installed here (pip install 'caneflow[dev]')")
 server = pytest.importorskip("caneflow.viewing.server", reason="the extra `view` is not installed here")
-from playwright.sync_api import Browser, Page, sync_playwright  # noqa: E402
+from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: E402
 
 CHROMIUM = shutil.which("chromium")
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -355,7 +355,7 @@ def test_everything_can_be_done_by_keys(shown: tuple[Page, LiveStreams]) -> None
     page.keyboard.press("f")
     assert page.get_attribute("#follow", "aria-pressed") == "true"
     page.keyboard.press("?")
-    assert page.get_by_role("dialog", name="Keys").is_visible()
+    expect(page.get_by_role("dialog", name="Keys")).to_be_visible(timeout=1e3 * DEADLINE)
     page.keyboard.press("Escape")
 
 
@@ -385,7 +385,7 @@ def test_what_is_shown_has_roles_and_names(shown: tuple[Page, LiveStreams]) -> N
     ]  # fmt: skip
     for role, name in roles:
         found = page.get_by_role(role, name=name) if name else page.get_by_role(role)
-        assert found.first.is_visible(), (role, name)
+        expect(found.first).to_be_visible(timeout=1e3 * DEADLINE)  # waits for the next drawing
     unnamed = page.eval_on_selector_all(
         "button, select, input, [role=img], [role=region]",
         """all => all.filter((each) => !(each.ariaLabel || each.textContent.trim() || each.labels?.length

@@ -129,6 +129,12 @@ class Pose(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
     orientation: Annotated[Quaternion, Meta(description="w x y z, body to world")]
     method: Annotated[str, Meta(description="the estimator's name")]
     covariance: Annotated[Array | None, Meta(description="(6, 6) float64 of position and velocity")] = None
+    status: Annotated[
+        str | None,
+        Meta(
+            description="on what the estimate rests, in words: static_or_lost, without:south ...; absent: all is well"
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         require_finite("position", self.position)

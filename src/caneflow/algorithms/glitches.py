@@ -1,0 +1,118 @@
+"""Single wild readings of an inertial sensor: held at the value before, so that no filter ever sees them.
+
+A bus that drops a bit gives one full-scale reading among good ones. No hand accelerates or turns the cane that much
+from one sample to the next; what stays there for longer than a few samples is believed again (estimators.md).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Generic, NamedTuple, TypeVar
+
+from annotated_types import Ge, Gt, Le
+
+from caneflow.algorithms.rotations import Quaternion, Vector
+
+V = TypeVar("V")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GlitchSettings:
+    """How far a reading may be from the last good one; measured to cancel single wild ones and touch no walk."""
+
+    acceleration: Annotated[float, Gt(0), Le(1e4)] = 10.0  # m/s^2
+    turn_rate: Annotated[float, Gt(0), Le(1e3)] = math.radians(120.0)  # rad/s
+    field: Annotated[float, Gt(0), Le(1e5)] = 60.0  # uT
+    rotation: Annotated[float, Gt(0), Le(math.pi)] = math.radians(10.0)  # rad, between two attitudes
+    most_held: Annotated[int, Ge(0), Le(1000)] = 3  # samples; what lasts longer is no glitch
+    longest_gap: Annotated[float, Gt(0), Le(10.0)] = 0.05  # s; across a longer one anything may have happened
+
+
+class JumpGate(Generic[V]):
+    """One quantity that jumps from its last good value by more than `limit` is held there, for a few samples.
+
+    A value that no other one has agreed with yet (the first, one after a gap, one that lasted) holds nothing up:
+    were it the wild one, the good ones after it would be held.
+    """
+
+    def __init__(
+        self, limit: float, distance: Callable[[V, V], float], *, most_held: int = 3, longest_gap: float = 0.05
+    ) -> None:
+        """`limit` in the unit of `distance`, which tells how far two values are apart; `longest_gap` in s."""
+        self._limit, self._distance = limit, distance
+        self._most_held, self._longest_gap_ns = most_held, round(longest_gap * 1e9)
+        self._good: V | None = None
+        self._confirmed = False
+        self._last_ns = 0  # stamp of the last value, good or held
+        self._held = 0  # in a row
+        self.holding = False  # the last value was held
+
+    def update(self, stamp_ns: int, value: V) -> V:
+        """`value`, or the last good one in its place."""
+        good, near = self._good, False
+        if good is not None and stamp_ns - self._last_ns <= self._longest_gap_ns:
+            near = self._distance(value, good) <= self._limit
+            if not near and self._confirmed and self._held < self._most_held:
+                self._last_ns, self.holding = stamp_ns, True
+                self._held += 1
+                return good
+        self._good, self._confirmed, self._last_ns = value, near, stamp_ns
+        self._held, self.holding = 0, False
+        return value
+
+
+class Readings(NamedTuple):
+    """One IMU sample, body frame; None: the sensor does not have it."""
+
+    gyro: Vector  # rad/s
+    accel: Vector | None  # m/s^2, specific force
+    mag: Vector | None  # uT
+    orientation: Quaternion | None  # w x y z, body to world
+    linear_accel: Vector | None  # m/s^2, gravity removed
+
+
+class GlitchGate:
+    """A gate for each part of an IMU sample. `held`: which parts of the last sample were held."""
+
+    def __init__(self, settings: GlitchSettings) -> None:
+        s = settings
+
+        def vectors(limit: float) -> JumpGate[Vector]:
+            return JumpGate(limit, math.dist, most_held=s.most_held, longest_gap=s.longest_gap)
+
+        self._gyro, self._mag = vectors(s.turn_rate), vectors(s.field)
+        self._accel, self._linear_accel = vectors(s.acceleration), vectors(s.acceleration)
+        self._orientation: JumpGate[Quaternion] = JumpGate(
+            s.rotation, _angle, most_held=s.most_held, longest_gap=s.longest_gap
+        )
+        self.held: tuple[str, ...] = ()
+
+    def update(self, stamp_ns: int, readings: Readings) -> Readings:
+        """The readings of a sample, the last good one in the place of each that is wild."""
+        gyro, accel, mag, orientation, linear = readings
+        gyro = self._gyro.update(stamp_ns, gyro)
+        held: tuple[str, ...] = ("gyro",) if self._gyro.holding else ()
+        if accel is not None:
+            accel = self._accel.update(stamp_ns, accel)
+            if self._accel.holding:
+                held += ("accel",)
+        if mag is not None:
+            mag = self._mag.update(stamp_ns, mag)
+            if self._mag.holding:
+                held += ("mag",)
+        if orientation is not None:
+            orientation = self._orientation.update(stamp_ns, orientation)
+            if self._orientation.holding:
+                held += ("orientation",)
+        if linear is not None:
+            linear = self._linear_accel.update(stamp_ns, linear)
+            if self._linear_accel.holding:
+                held += ("linear_accel",)
+        self.held = held
+        return Readings(gyro, accel, mag, orientation, linear) if held else readings
+
+
+def _angle(a: Quaternion, b: Quaternion) -> float:
+    """Of the rotation from one attitude to the other, rad."""
+    w = abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3])
+    return 2.0 * math.acos(min(w, 1.0))
