@@ -119,6 +119,48 @@ def test_a_writer_that_was_restarted_and_counts_anew_is_followed() -> None:
     assert (counts.lost, counts.repeated, counts.waiting) == (7, 0, 3)
 
 
+def test_two_writers_on_one_key_are_named_and_nothing_counts_as_lost(caplog: pytest.LogCaptureFixture) -> None:
+    host = stage()
+    numbers = [(seq, 20 * seq) for seq in range(100)] + [(seq, 1510 + 20 * seq) for seq in range(25)]
+    order = sorted(numbers, key=lambda number: number[1])  # from seq 76 of the first on they take turns
+    for seq, stamp in order:
+        host.offer("a", imu(stamp + 1, seq))
+    counts = host.input_counts()["a"]
+    assert (counts.received, counts.lost, counts.repeated, counts.refused) == (125, 0, 0, 0)
+    assert counts.waiting == 125
+    assert [line for line in caplog.text.splitlines() if "f/a/imu" in line] == [
+        line for line in caplog.text.splitlines() if "two programs write on this key" in line
+    ]
+    assert "two programs write on this key (one is at seq 76, one at 1)" in caplog.text
+
+
+def test_who_restarts_and_loses_a_sample_later_is_no_second_writer(caplog: pytest.LogCaptureFixture) -> None:
+    host = stage()
+    for seq in (*range(2000), *range(1999), 2000):
+        host.offer("a", imu(1 + host.input_counts()["a"].received, seq))
+    assert host.input_counts()["a"].lost == 1
+    assert "two programs" not in caplog.text
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 12), st.integers(0, 30), st.booleans(), st.booleans()), max_size=40),
+    st.booleans(),
+)
+def test_at_any_time_what_was_received_is_the_sum_of_what_became_of_it(
+    steps: list[tuple[int, int, bool, bool]], patient: bool
+) -> None:
+    host = stage(length=3)
+    host.inputs["a"].patient = patient
+    host.mark("b", PortMark(-1, 25))
+    for seq, stamp, negative, works in steps:
+        host.offer("a", imu(stamp, seq, -1.0 if negative else 1.0))
+        if works:
+            host.step(None)
+        counts = host.input_counts()["a"]
+        became = counts.handled + counts.refused + counts.repeated + counts.dropped + counts.late + counts.left_out
+        assert counts.received == became + counts.waiting
+
+
 def test_a_sample_that_cannot_be_decoded_is_refused_once_not_lost_as_well() -> None:
     host = stage()
     host.mark("b", PortMark(-1, END))

@@ -49,7 +49,7 @@ class LeftOut(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class InputCounts(msgspec.Struct, kw_only=True, gc=False):
-    """What became of the samples of one input: received is the sum of all the others but lost."""
+    """What became of the samples of one input: at any time received is the sum of all the others but lost."""
 
     received: int = 0
     handled: int = 0

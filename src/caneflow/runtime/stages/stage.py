@@ -183,7 +183,7 @@ class Stage:
     def input_counts(self) -> dict[str, InputCounts]:
         """What became of every sample that came, per port."""
         for port, arrivals in self.inputs.items():
-            arrivals.counts.waiting = self._merge.waiting(port)
+            arrivals.counts.waiting = self._merge.waiting(port) + len(arrivals.ahead)
         return {port: arrivals.counts for port, arrivals in self.inputs.items()}
 
     def _queue(self, port: str, arrivals: Arrivals, message: Sample) -> None:

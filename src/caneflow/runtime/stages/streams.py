@@ -22,6 +22,7 @@ FAR_AHEAD = (
     1_000_000_000  # ns that a live stamp may lie ahead of its clock, which is known to some ms; sensors stamp the past
 )
 FAR_AHEAD_UNKNOWN = 100 * 365 * 86_400 * 1_000_000_000  # ns, while the writer's clock is not known: 1970 to 2070
+SECOND_WRITER = 1_000  # samples of one writer between two of another, at most: more, and it was a restart
 SILENCES_NAMED = 10  # per stream: one that is slow is not to be complained of for ever
 
 
@@ -47,6 +48,8 @@ class Arrivals:
     budget: int = WAITING  # bytes that those may take
     ahead_held: int = 0  # bytes that they take
     newest: int = -1  # seq of the last sample that is known to be sent, while some are missing
+    other: int | None = None  # seq that was due when the numbers went back: who goes on there is a second writer
+    other_since: int = 0  # seq to which they went back
     _ahead_first: int | None = None  # the smallest seq of those that wait
     _named: set[str] = field(default_factory=set)
     _silences: int = 0  # that were said
@@ -99,6 +102,8 @@ class Arrivals:
             self.take_next(message)
             return [message]
         self.counts.received += 1
+        if message.seq == self.other and not again and self.expected - self.other_since <= SECOND_WRITER:
+            self._change_writer()
         if message.stamp <= self.last_stamp or message.seq in self.ahead:
             self._refuse_old(message, again=again)
             return []
@@ -153,6 +158,15 @@ class Arrivals:
         self.newest = max(self.newest, seq)
         self._ahead_first = seq if self._ahead_first is None else min(self._ahead_first, seq)
 
+    def _change_writer(self) -> None:
+        """Two programs write on this key, each with numbers of its own: that is neither a restart nor a loss."""
+        self.expected, self.other = self.other or 0, self.expected
+        self.other_since, self.unreadable = self.expected, 0
+        self._say_once(
+            "writers",
+            f"two programs write on this key (one is at seq {self.expected}, one at {self.other}); end or rename one",
+        )
+
     def _refuse_old(self, message: Sample, *, again: bool) -> None:
         if again:
             self.counts.received -= 1
@@ -167,7 +181,7 @@ class Arrivals:
     def _next(self, message: Sample) -> Sample:
         # A smaller seq with a newer stamp is a writer that was restarted and counts anew.
         if message.seq < self.expected:
-            self.newest = message.seq
+            self.newest, self.other, self.other_since = message.seq, self.expected, message.seq
         self._note_silence(message)
         self.expected, self.unreadable = message.seq + 1, 0
         self.last_stamp = message.stamp

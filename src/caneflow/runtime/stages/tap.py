@@ -105,6 +105,8 @@ class Tap:
 
     def input_counts(self) -> dict[str, InputCounts]:
         """What became of every sample that came, per port."""
+        for arrivals in self.inputs.values():
+            arrivals.counts.waiting = len(arrivals.ahead)
         return {port: arrivals.counts for port, arrivals in self.inputs.items()}
 
     def _take(self, port: str, message: Sample, time: int) -> None:
