@@ -3,6 +3,7 @@
 import math
 import re
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,7 @@ def fields_of(message: Sample, **changes: object) -> bytes:
     return bytes(msgpack.packb(fields, default=lambda a: msgpack.ExtType(1, to_bytes(a))))
 
 
-IMU, FRAME, SPEED, POSE = EXAMPLES[0], EXAMPLES[2], EXAMPLES[4], EXAMPLES[5]
+IMU, FRAME, SPEED, POSE, BLOCK, TARGET = (EXAMPLES[i] for i in (0, 2, 4, 5, 6, 7))
 NAN = float("nan")
 
 
@@ -155,13 +156,15 @@ NAN = float("nan")
         (FRAME, {"scans": np.zeros((0, 6), np.int32)}, "none of them empty"),
         (FRAME, {"scans": np.full((1, 2), np.nan, np.float32)}, "scans has elements that are NaN"),
         (FRAME, {"scans": [1, 2]}, "Expected `numpy.ndarray`, got `list` - at `$.scans`"),
-        (FRAME, {"scan_period": 0.0}, "Expected `float` > 0.0 - at `$.scan_period`"),
+        (FRAME, {"scan_period": 0.0}, "scan_period is 0.0; expected 1e-06 to 60 s"),
         (FRAME, {"range_start": NAN}, "range_start"),
         (SPEED, {"quality": NAN}, "quality is nan"),
         (SPEED, {"quality": -0.1}, "quality is -0.1"),
-        (SPEED, {"speed": math.inf}, "speed, delay, velocity_delay is (inf,"),
+        (SPEED, {"speed": math.inf}, "speed is inf; NaN and infinity are not allowed"),
         (SPEED, {"valid": 1}, "Expected `bool`, got `int`"),
         (SPEED, {"velocity_cov": [-1.0, 0.0, 1.0]}, "variances are 0 or more"),
+        (SPEED, {"velocity_cov": [1.0, 2.0, 1.0]}, "expected xy^2 to be at most xx times yy"),
+        (SPEED, {"quality": 1e4}, "quality is 10000.0; it is 0 to 1000 m/s, or +inf"),
         (POSE, {"covariance": np.eye(5)}, "covariance has shape (5, 5), not (6, 6)"),
         (POSE, {"method": None}, "Expected `str`, got `None`"),
     ],
@@ -170,6 +173,100 @@ def test_what_breaks_the_contract_is_refused_by_name(message: Sample, changes: d
     with pytest.raises(MessageError) as caught:
         decode(fields_of(message, **changes), type(message))
     assert cause in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("message", "changes", "cause"),
+    [
+        (IMU, {"gyro": [1e200, 0.0, 0.0]}, "gyro is (1e+200, 0.0, 0.0); expected -100 to 100 rad/s"),
+        (IMU, {"gyro": [0.0, -101.0, 0.0]}, "gyro is (0.0, -101.0, 0.0); expected -100 to 100 rad/s"),
+        (IMU, {"accel": [0.0, 0.0, 9806.65]}, "accel is (0.0, 0.0, 9806.65); expected -4000 to 4000 m/s^2"),
+        (IMU, {"linear_accel": [0.0, 1e10, 0.0]}, "expected -4010 to 4010 m/s^2"),
+        (IMU, {"mag": [1e30, 0.0, 0.0]}, "expected -10000 to 10000 uT"),
+        (FRAME, {"scans": np.array([[0, -1e30]], np.float32)}, "1e+30; expected -4.29497e+09 to 4.29497e+09"),
+        (FRAME, {"scans": np.array([[0, 1e10j]], np.complex64)}, "scans has an element of 1e+10; expected"),
+        (FRAME, {"scan_period": 1e-300}, "scan_period is 1e-300; expected 1e-06 to 60 s"),
+        (FRAME, {"range_step": 1e200}, "range_step is 1e+200; expected 1e-05 to 1000 m"),
+        (FRAME, {"range_start": -1e200}, "range_start is -1e+200; expected -100 to 100000 m"),
+        (FRAME, {"carrier": 1e200}, "carrier is 1e+200; expected 1e+06 to 1e+12 Hz"),
+        (FRAME, {"bandwidth": 1e-200}, "bandwidth is 1e-200; expected 1 to 1e+12 Hz"),
+        (SPEED, {"speed": 1e30}, "speed is 1e+30; expected -100 to 100 m/s"),
+        (SPEED, {"velocity": [0.0, -1e200]}, "velocity is (0.0, -1e+200); expected -100 to 100 m/s"),
+        (SPEED, {"delay": 1e308}, "delay is 1e+308; expected 0 to 60 s"),
+        (SPEED, {"velocity_delay": -0.1}, "velocity_delay is -0.1; expected 0 to 60 s"),
+        (SPEED, {"velocity_cov": [1e200, 0.0, 1.0]}, "expected -1e+12 to 1e+12 m^2/s^2"),
+        (SPEED, {"rays": 10**9}, "rays is 1000000000; expected 0 to 1e+06"),
+        (POSE, {"position": [1e200, 0.0, 0.0]}, "expected -4.1e+07 to 4.1e+07 m"),
+        (POSE, {"velocity": [0.0, 0.0, 1e30]}, "velocity is (0.0, 0.0, 1e+30); expected -1000 to 1000 m/s"),
+        (POSE, {"covariance": np.eye(6) * 1e200}, "covariance has an element of 1e+200; expected -1e+16 to 1e+16"),
+        (POSE, {"covariance": -np.eye(6)}, "variances are 0 or more"),
+        (BLOCK, {"samples": np.array([1e30], np.float32)}, "an element of 1e+30; expected -100000 to 100000"),
+        (BLOCK, {"samples": np.array([0, -1e6j], np.complex64)}, "samples has an element of 1e+06; expected"),
+        (BLOCK, {"sample_rate": 1e200}, "sample_rate is 1e+200; expected 1 to 1e+08 Hz"),
+        (TARGET, {"range_rate": 1e200}, "range_rate is 1e+200; expected -1000 to 1000 m/s"),
+        (TARGET, {"amplitude": 1e30}, "amplitude is 1e+30; expected 0 to 1e+06"),
+        (TARGET, {"amplitude": -1e-3}, "amplitude is -0.001; expected 0 to 1e+06"),
+        (TARGET, {"snr": -math.inf}, "snr is -inf; NaN and infinity are not allowed"),
+        (TARGET, {"snr": 1e9}, "snr is 1000000000.0; expected -400 to 400 dB"),
+        (TARGET, {"range": 1e30}, "range is 1e+30; expected 0 to 100000 m"),
+        (TARGET, {"delay": 1e308}, "delay is 1e+308; expected 0 to 60 s"),
+    ],
+)  # fmt: skip
+def test_what_no_sensor_can_say_is_refused(message: Sample, changes: dict[str, Any], cause: str) -> None:
+    with pytest.raises(MessageError) as caught:
+        decode(fields_of(message, **changes), type(message))
+    assert cause in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_a_sensor_says_when_it_is_wild_is_taken() -> None:
+    """The ends of a BNO055's and an MPU9250's numbers, sound in counts of 16 bits, a velocity that is not observed."""
+    for message in (
+        Imu(stamp=1, gyro=(35.7, -35.8, 0.0), accel=(327.67, -327.68, 0.0), linear_accel=(-327.68, 0.0, 0.0)),
+        Imu(stamp=1, gyro=(70.0, 0.0, 0.0), mag=(4912.0, -4912.0, 0.0)),
+        RadarFrame(
+            stamp=1, scans=np.full((1, 2), 2**31, np.float32), scan_period=0.01, range_start=-0.5, range_step=0.009,
+            carrier=4.3e9, bandwidth=1.7e9,
+        ),
+        GroundSpeed(
+            stamp=1, speed=0.0, quality=math.inf, rays=0, valid=False, velocity=(0.0, 0.0), velocity_cov=(1e6, 0.0, 1e6)
+        ),
+        DopplerBlock(stamp=1, samples=np.full(3, -32768, np.float32), sample_rate=4000.0, carrier=24.125e9),
+    ):  # fmt: skip
+        assert encode(decode(numbered(message, 0), type(message))) == encode(message)
+
+
+def bounds_of(spec: dict[str, Any]) -> Iterator[tuple[float, float]]:
+    """The bounds of a field's numbers, by its JSON Schema; raises KeyError where there are none."""
+    if spec.get("type") in ("number", "integer"):
+        yield spec["minimum"], spec["maximum"]
+    for inner in (*spec.get("anyOf", ()), *spec.get("prefixItems", ())):
+        yield from bounds_of(inner)
+
+
+@pytest.mark.parametrize("message", [IMU, FRAME, SPEED, POSE, BLOCK, TARGET], ids=lambda m: type(m).__name__)
+def test_every_number_of_every_message_has_bounds_that_its_schema_says(message: Sample) -> None:
+    """At a bound a number is taken, just beyond it is not: a new field without bounds fails here."""
+    for name, spec in json_schema(type(message))["properties"].items():
+        if name in ("stamp", "seq", "quality", "orientation", "velocity_cov"):  # quality may be +inf; the others: above
+            continue
+        found = list(bounds_of(spec))
+        for i, (least, most) in enumerate(found):
+            step = 1 if isinstance(most, int) else max(1e-9, abs(most) * 1e-9)
+            for value, right in ((least, True), (most, True), (least - step, False), (most + step, False)):
+                old = getattr(message, name)
+                new = (*old[:i], value, *old[i + 1 :]) if isinstance(old, tuple) else value
+                payload = fields_of(message, **{name: new})
+                if right:
+                    assert getattr(decode(payload, type(message)), name) == new
+                else:
+                    with pytest.raises(MessageError, match=name):
+                        decode(payload, type(message))
+        old = getattr(message, name)
+        numbers = (
+            len(old) if isinstance(old, tuple) else int(isinstance(old, int | float) and not isinstance(old, bool))
+        )
+        assert len(found) == numbers, f"{name} is not bounded"
 
 
 def test_truncated_trailing_oversized_and_foreign_bytes_are_refused() -> None:

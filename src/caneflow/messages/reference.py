@@ -1,5 +1,6 @@
 """The tables of docs/messages.md, written by `python -m caneflow.messages.reference docs`."""
 
+import math
 import re
 import sys
 from pathlib import Path
@@ -10,14 +11,14 @@ from caneflow.messages.samples import SAMPLES
 
 
 def table(name: str) -> str:
-    """The Markdown table of message `name`, e.g. `Imu`: field, type, meaning; stamp and seq are common to all."""
+    """The Markdown table of message `name`, e.g. `Imu`: field, type, bounds, meaning; without stamp and seq."""
     kind = next(kind for kind in SAMPLES.values() if kind.__name__ == name)
     schema = json_schema(kind)
-    rows = ["| field | type | meaning |", "|---|---|---|"]
+    rows = ["| field | type | from, to | meaning |", "|---|---|---|---|"]
     for field, spec in schema["properties"].items():
         if field not in ("stamp", "seq"):
             optional = "" if field in schema["required"] else "?"
-            rows.append(f"| `{field}`{optional} | {_type(spec)} | {spec.get('description', '')} |")
+            rows.append(f"| `{field}`{optional} | {_type(spec)} | {_bounds(spec)} | {spec.get('description', '')} |")
     return "\n".join(rows) + "\n"
 
 
@@ -49,6 +50,16 @@ def _type(spec: dict[str, Any]) -> str:
             return "bool"
         case _:
             return "array"
+
+
+def _bounds(spec: dict[str, Any]) -> str:
+    """The least and the greatest value of a field, or of each of its elements."""
+    for inner in (*spec.get("anyOf", ()), *spec.get("prefixItems", ())):
+        if found := _bounds(inner):
+            return found
+    if "minimum" not in spec:
+        return ""
+    return f"{spec['minimum']:g}, {spec.get('maximum', math.inf):g}"
 
 
 if __name__ == "__main__":

@@ -4,24 +4,36 @@ A sample checks itself when it is made, so a bad one is refused on the way in an
 """
 
 import math
-from collections.abc import Sequence
 from typing import Annotated, ClassVar, TypeAlias
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
+from caneflow.messages import bounds
 from caneflow.messages.arrays import Array
+from caneflow.messages.bounds import (
+    require_array,
+    require_covariance,
+    require_pair,
+    require_unit,
+    require_vector,
+    require_within,
+)
 
-Vector2: TypeAlias = tuple[float, float]
 Vector3: TypeAlias = tuple[float, float, float]
-Quaternion: TypeAlias = tuple[float, float, float, float]
-Positive: TypeAlias = Annotated[float, Meta(gt=0)]
-Count: TypeAlias = Annotated[int, Meta(ge=0)]
+TurnRates: TypeAlias = tuple[bounds.TurnRate, bounds.TurnRate, bounds.TurnRate]
+Accelerations: TypeAlias = tuple[bounds.Acceleration, bounds.Acceleration, bounds.Acceleration]
+LinearAccelerations: TypeAlias = tuple[bounds.LinearAcceleration, bounds.LinearAcceleration, bounds.LinearAcceleration]
+MagneticFields: TypeAlias = tuple[bounds.MagneticField, bounds.MagneticField, bounds.MagneticField]
+Quaternion: TypeAlias = tuple[bounds.Cosine, bounds.Cosine, bounds.Cosine, bounds.Cosine]
+Levels: TypeAlias = tuple[bounds.Level, bounds.Level, bounds.Level, bounds.Level]
+Speeds: TypeAlias = tuple[bounds.Speed, bounds.Speed]
+SpeedVariances: TypeAlias = tuple[bounds.SpeedVariance, bounds.SpeedVariance, bounds.SpeedVariance]
+Positions: TypeAlias = tuple[bounds.Position, bounds.Position, bounds.Position]
+Velocities: TypeAlias = tuple[bounds.Velocity, bounds.Velocity, bounds.Velocity]
 Stamp: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 2)]  # one more says that a stream has ended
 
 UNNUMBERED = -1  # a sample that no host has published yet
-UNIT_TOLERANCE = 1e-3  # how far a quaternion's norm may be from 1
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, gc=False):
@@ -40,27 +52,24 @@ class Imu(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
 
     schema = "caneflow.Imu/1"
 
-    gyro: Annotated[Vector3, Meta(description="rad/s, body")]
-    accel: Annotated[Vector3 | None, Meta(description="m/s^2, specific force, body (rest: +9.81 on z)")] = None
-    mag: Annotated[Vector3 | None, Meta(description="uT, body")] = None
+    gyro: Annotated[TurnRates, Meta(description="rad/s, body")]
+    accel: Annotated[Accelerations | None, Meta(description="m/s^2, specific force, body (rest: +9.81 on z)")] = None
+    mag: Annotated[MagneticFields | None, Meta(description="uT, body")] = None
     orientation: Annotated[Quaternion | None, Meta(description="w x y z, body to world, the chip's own fusion")] = None
-    linear_accel: Annotated[Vector3 | None, Meta(description="m/s^2, body, gravity removed")] = None
-    calibration: Annotated[
-        tuple[Count, Count, Count, Count] | None,
-        Meta(description="BNO055 levels sys, gyro, accel, mag, 0..3"),
-    ] = None
+    linear_accel: Annotated[LinearAccelerations | None, Meta(description="m/s^2, body, gravity removed")] = None
+    calibration: Annotated[Levels | None, Meta(description="BNO055 levels sys, gyro, accel, mag")] = None
 
     def __post_init__(self) -> None:
-        require_finite("gyro", self.gyro)
+        require_vector("gyro", self.gyro, bounds.TURN_RATE, "rad/s")
         if self.accel is not None:
-            require_finite("accel", self.accel)
+            require_vector("accel", self.accel, bounds.ACCELERATION, "m/s^2")
         if self.mag is not None:
-            require_finite("mag", self.mag)
+            require_vector("mag", self.mag, bounds.MAGNETIC_FIELD, "uT")
         if self.linear_accel is not None:
-            require_finite("linear_accel", self.linear_accel)
+            require_vector("linear_accel", self.linear_accel, bounds.LINEAR_ACCELERATION, "m/s^2")
         if self.orientation is not None:
             require_unit("orientation", self.orientation)
-        if self.calibration is not None and max(self.calibration) > 3:
+        if self.calibration is not None and not (min(self.calibration) >= 0 and max(self.calibration) <= 3):
             raise ValueError(f"calibration is {self.calibration}; levels are 0..3")
 
 
@@ -71,20 +80,24 @@ class RadarFrame(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False
 
     scans: Annotated[
         Array,
-        Meta(description="(N, M) int16, int32, float32 or complex64: N scans, oldest first, of M range bins"),
+        Meta(
+            description="(N, M) int16, int32, float32 or complex64 (parts of floats within 4.3e9): N scans, oldest "
+            "first, of M range bins"
+        ),
     ]
-    scan_period: Annotated[Positive, Meta(description="s between scans")]
-    range_start: Annotated[float, Meta(description="m, range of bin 0, antenna delay taken off")]
-    range_step: Annotated[Positive, Meta(description="m between bins")]
-    carrier: Annotated[Positive, Meta(description="Hz")]
-    bandwidth: Annotated[Positive, Meta(description="Hz")]
+    scan_period: Annotated[bounds.ScanPeriod, Meta(description="s between scans")]
+    range_start: Annotated[bounds.RangeStart, Meta(description="m, range of bin 0, antenna delay taken off")]
+    range_step: Annotated[bounds.RangeStep, Meta(description="m between bins")]
+    carrier: Annotated[bounds.Carrier, Meta(description="Hz")]
+    bandwidth: Annotated[bounds.Bandwidth, Meta(description="Hz")]
 
     def __post_init__(self) -> None:
-        require_array("scans", self.scans, "hifF", dimensions=2)
-        require_finite(
-            "range_start, scan_period, range_step, carrier, bandwidth",
-            (self.range_start, self.scan_period, self.range_step, self.carrier, self.bandwidth),
-        )
+        require_array("scans", self.scans, "hifF", dimensions=2, most=bounds.SCAN)
+        require_within("scan_period", self.scan_period, *bounds.SCAN_PERIOD, "s")
+        require_within("range_start", self.range_start, *bounds.RANGE_START, "m")
+        require_within("range_step", self.range_step, *bounds.RANGE_STEP, "m")
+        require_within("carrier", self.carrier, *bounds.CARRIER, "Hz")
+        require_within("bandwidth", self.bandwidth, *bounds.BANDWIDTH, "Hz")
 
 
 class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
@@ -92,31 +105,35 @@ class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fals
 
     schema = "caneflow.GroundSpeed/1"
 
-    speed: Annotated[float, Meta(description="m/s (paper eq. 3); 0 when not valid")]
+    speed: Annotated[bounds.Speed, Meta(description="m/s (paper eq. 3); 0 when not valid")]
     quality: Annotated[
-        float, Meta(description="m/s (paper eq. 4), spread over the rays, smaller is better; +inf: none")
+        bounds.Spread,
+        Meta(description="m/s (paper eq. 4), spread over the rays, smaller is better; at most 1000, or +inf: none"),
     ]
-    rays: Annotated[Count, Meta(description="K used")]
+    rays: Annotated[bounds.Rays, Meta(description="K used")]
     valid: Annotated[bool, Meta(description="false when too few rays agree")]
-    delay: Annotated[float | None, Meta(description="s by which speed lags the stamp")] = None
+    delay: Annotated[bounds.Delay | None, Meta(description="s by which speed lags the stamp")] = None
     velocity: Annotated[
-        Vector2 | None, Meta(description="m/s horizontal: along the boresight's projection, to its left")
+        Speeds | None, Meta(description="m/s horizontal: along the boresight's projection, to its left")
     ] = None
-    velocity_cov: Annotated[Vector3 | None, Meta(description="xx, xy, yy of velocity, m^2/s^2; 1e6: not observed")] = (
-        None
-    )
-    velocity_delay: Annotated[float | None, Meta(description="s by which velocity lags the stamp")] = None
+    velocity_cov: Annotated[
+        SpeedVariances | None, Meta(description="xx, xy, yy of velocity, m^2/s^2; 1e6: not observed")
+    ] = None
+    velocity_delay: Annotated[bounds.Delay | None, Meta(description="s by which velocity lags the stamp")] = None
 
     def __post_init__(self) -> None:
-        require_finite("speed, delay, velocity_delay", (self.speed, self.delay or 0.0, self.velocity_delay or 0.0))
-        if not self.quality >= 0:  # also refuses NaN; +inf is allowed
-            raise ValueError(f"quality is {self.quality}; it is 0 or more, or +inf")
+        require_within("speed", self.speed, -bounds.SPEED, bounds.SPEED, "m/s")
+        if not (0 <= self.quality <= bounds.SPREAD or self.quality == math.inf):  # also refuses NaN
+            raise ValueError(f"quality is {self.quality}; it is 0 to {bounds.SPREAD:g} m/s, or +inf")
+        require_within("rays", self.rays, 0, bounds.RAYS)
+        if self.delay is not None:
+            require_within("delay", self.delay, 0.0, bounds.DELAY, "s")
         if self.velocity is not None:
-            require_finite("velocity", self.velocity)
+            require_pair("velocity", self.velocity, bounds.SPEED, "m/s")
         if self.velocity_cov is not None:
-            require_finite("velocity_cov", self.velocity_cov)
-            if self.velocity_cov[0] < 0 or self.velocity_cov[2] < 0:
-                raise ValueError(f"velocity_cov is {self.velocity_cov}; variances are 0 or more")
+            require_covariance("velocity_cov", self.velocity_cov)
+        if self.velocity_delay is not None:
+            require_within("velocity_delay", self.velocity_delay, 0.0, bounds.DELAY, "s")
 
 
 class Pose(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
@@ -124,11 +141,13 @@ class Pose(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
 
     schema = "caneflow.Pose/1"
 
-    position: Annotated[Vector3, Meta(description="m, R0")]
-    velocity: Annotated[Vector3, Meta(description="m/s, R0")]
+    position: Annotated[Positions, Meta(description="m, R0")]
+    velocity: Annotated[Velocities, Meta(description="m/s, R0")]
     orientation: Annotated[Quaternion, Meta(description="w x y z, body to world")]
     method: Annotated[str, Meta(description="the estimator's name")]
-    covariance: Annotated[Array | None, Meta(description="(6, 6) float64 of position and velocity")] = None
+    covariance: Annotated[
+        Array | None, Meta(description="(6, 6) float64 of position and velocity, elements within 1e16")
+    ] = None
     status: Annotated[
         str | None,
         Meta(
@@ -137,13 +156,16 @@ class Pose(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
     ] = None
 
     def __post_init__(self) -> None:
-        require_finite("position", self.position)
-        require_finite("velocity", self.velocity)
+        require_vector("position", self.position, bounds.POSITION, "m")
+        require_vector("velocity", self.velocity, bounds.VELOCITY, "m/s")
         require_unit("orientation", self.orientation)
         if self.covariance is not None:
-            require_array("covariance", self.covariance, "fd", dimensions=2)
+            require_array("covariance", self.covariance, "fd", dimensions=2, most=bounds.COVARIANCE)
             if self.covariance.shape != (6, 6):
                 raise ValueError(f"covariance has shape {self.covariance.shape}, not (6, 6)")
+            variances = self.covariance.diagonal().tolist()
+            if min(variances) < 0:
+                raise ValueError(f"covariance has the diagonal {variances}; variances are 0 or more")
 
 
 class DopplerBlock(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
@@ -151,13 +173,17 @@ class DopplerBlock(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fal
 
     schema = "caneflow.DopplerBlock/1"
 
-    samples: Annotated[Array, Meta(description="(n,) int16, float32 or complex64 (I + jQ)")]
-    sample_rate: Annotated[Positive, Meta(description="Hz")]
-    carrier: Annotated[Positive, Meta(description="Hz")]
+    samples: Annotated[
+        Array,
+        Meta(description="(n,) int16, float32 or complex64 (I + jQ); of floats full scale is 1, parts within 1e5"),
+    ]
+    sample_rate: Annotated[bounds.SampleRate, Meta(description="Hz")]
+    carrier: Annotated[bounds.Carrier, Meta(description="Hz")]
 
     def __post_init__(self) -> None:
-        require_array("samples", self.samples, "hfF", dimensions=1)
-        require_finite("sample_rate, carrier", (self.sample_rate, self.carrier))
+        require_array("samples", self.samples, "hfF", dimensions=1, most=bounds.SOUND)
+        require_within("sample_rate", self.sample_rate, *bounds.SAMPLE_RATE, "Hz")
+        require_within("carrier", self.carrier, *bounds.CARRIER, "Hz")
 
 
 class DopplerTarget(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
@@ -165,46 +191,26 @@ class DopplerTarget(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fa
 
     schema = "caneflow.DopplerTarget/1"
 
-    range_rate: Annotated[float, Meta(description="m/s, positive away from the sensor; magnitude when not signed")]
+    range_rate: Annotated[
+        bounds.RangeRate, Meta(description="m/s, positive away from the sensor; magnitude when not signed")
+    ]
     signed: Annotated[bool, Meta(description="false: one mixer, the sign is unknown")]
-    amplitude: Annotated[float, Meta(ge=0, description="of the predominant line, full scale = 1 (int16: 32768)")]
-    snr: Annotated[float, Meta(description="dB")]
+    amplitude: Annotated[bounds.Amplitude, Meta(description="of the predominant line, full scale = 1 (int16: 32768)")]
+    snr: Annotated[bounds.Snr, Meta(description="dB")]
     valid: Annotated[bool, Meta(description="false: no line above the threshold")]
-    range: Annotated[float | None, Meta(description="m, from the received strength")] = None
-    delay: Annotated[float | None, Meta(description="s by which the value lags its stamp")] = None
+    range: Annotated[bounds.TargetRange | None, Meta(description="m, from the received strength")] = None
+    delay: Annotated[bounds.Delay | None, Meta(description="s by which the value lags its stamp")] = None
 
     def __post_init__(self) -> None:
-        require_finite("range_rate", (self.range_rate,))
-        require_finite("amplitude, snr", (self.amplitude, self.snr))
-        require_finite("range, delay", (self.range or 0.0, self.delay or 0.0))
+        require_within("range_rate", self.range_rate, -bounds.RANGE_RATE, bounds.RANGE_RATE, "m/s")
+        require_within("amplitude", self.amplitude, 0.0, bounds.AMPLITUDE)
+        require_within("snr", self.snr, -bounds.SNR, bounds.SNR, "dB")
+        if self.range is not None:
+            require_within("range", self.range, 0.0, bounds.TARGET_RANGE, "m")
+        if self.delay is not None:
+            require_within("delay", self.delay, 0.0, bounds.DELAY, "s")
 
 
 SAMPLES: dict[str, type[Sample]] = {
     kind.schema: kind for kind in (Imu, RadarFrame, GroundSpeed, Pose, DopplerBlock, DopplerTarget)
 }
-
-
-def require_finite(name: str, values: Sequence[float]) -> None:
-    """Raise ValueError unless every value is a finite number."""
-    # One that is not leaves no sum finite; a sum may be infinite without any.
-    if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
-        raise ValueError(f"{name} is {values}; NaN and infinity are not allowed")
-
-
-def require_unit(name: str, quaternion: Quaternion) -> None:
-    """Raise ValueError unless the quaternion has norm 1 within UNIT_TOLERANCE."""
-    w, x, y, z = quaternion
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if not abs(norm - 1) <= UNIT_TOLERANCE:  # written so that NaN is refused
-        raise ValueError(f"{name} has norm {norm:.6g}; a rotation has 1")
-
-
-def require_array(name: str, array: Array, letters: str, *, dimensions: int) -> None:
-    """Raise ValueError unless dtype, number of dimensions and (for floats) finiteness fit."""
-    if array.dtype.char not in letters:
-        allowed = ", ".join(str(np.dtype(letter)) for letter in letters)
-        raise ValueError(f"{name} is of dtype {array.dtype}; allowed are {allowed}")
-    if array.ndim != dimensions or array.size == 0:
-        raise ValueError(f"{name} has shape {array.shape}; it takes {dimensions} dimensions, none of them empty")
-    if array.dtype.kind in "fc" and not np.isfinite(array).all():
-        raise ValueError(f"{name} has elements that are NaN or infinite")
