@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
-from annotated_types import Gt, Le
+from annotated_types import Ge, Le
 
+from caneflow.algorithms.quantities import Milliseconds, Time
 from caneflow.messages import Imu
 from caneflow.protocols import bno055
 from caneflow.protocols.bno055 import CalibrationProfile, Measurement, Mode
@@ -52,13 +53,13 @@ class Bno055Settings:
     address: Literal[0x28, 0x29] = 0x28  # on I2C; 0x29 with COM3 high
     baud: Literal[115200] = 115200  # bit/s, the only rate that the chip has
     mode: Literal["ndof", "imu"] = "ndof"  # the chip's fusion: with the magnetometer, or without
-    rate: Annotated[float, Gt(0), Le(100)] = 100.0  # Hz; 100: every value of the chip's fusion, once
+    rate: Annotated[float, Ge(0.01), Le(100)] = 100.0  # Hz; 100: every value of the chip's fusion, once
     external_crystal: bool = True
     axes: str = "+x+y+z"  # the chip's axes that are the body's x, y, z
     accel_and_mag: bool = True  # read these too; without them I2C with clock stretching keeps up with 100 Hz
     calibration_file: str | None = None  # given to the chip at the start, written at the end when it is calibrated
-    answer_timeout_ms: Annotated[float, Gt(0)] = 30.0  # ms; an adapter on USB may hold an answer back for 16
-    start_timeout_s: Annotated[float, Gt(0)] = 10.0  # s to the first sample; later the chip is waited for for ever
+    answer_timeout_ms: Milliseconds = 30.0  # ms; an adapter on USB may hold an answer back for 16
+    start_timeout_s: Time = 10.0  # s to the first sample; later the chip is waited for for ever
 
     def __post_init__(self) -> None:
         try:

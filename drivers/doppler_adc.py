@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from caneflow.algorithms.clock_fit import ClockFitSettings, LineBelow
-from caneflow.messages import DopplerBlock
+from caneflow.algorithms.quantities import Time
+from caneflow.messages import DopplerBlock, bounds
 from caneflow.protocols.doppler_blocks import BlockCutter, ModuleChannels, Samples, block_length
 from caneflow.recording.sound_file import SoundFile
 from caneflow.runtime import Brought, Context, Quiet, Source
@@ -43,13 +44,15 @@ class DopplerAdcSettings:
 
     device: str = "default"  # as PortAudio names it, or a part of the name that no other has, or its number
     file: str | None = None  # a WAV or FLAC file in the place of the device, played once in real time
-    channel: Annotated[int, Ge(0)] = 0  # of the device: the module's output, or I of an I/Q module
-    quadrature: Annotated[int, Ge(0)] | None = None  # channel of Q; None: a module with one mixer
-    sample_rate: Annotated[float, Gt(0)] = 4000.0  # Hz, of a device; a file has its own
+    channel: Annotated[int, Ge(0), Le(1023)] = 0  # of the device: the module's output, or I of an I/Q module
+    quadrature: Annotated[int, Ge(0), Le(1023)] | None = None  # channel of Q; None: a module with one mixer
+    sample_rate: Annotated[float, Ge(bounds.SAMPLE_RATE[0]), Le(bounds.SAMPLE_RATE[1])] = (
+        4000.0  # Hz, of a device; a file has its own
+    )
     sample_format: Literal["int16", "float32"] = "int16"  # of a device; float32 where the ADC has more than 16 bits
-    carrier: Annotated[float, Gt(0)] = 24.125e9  # Hz
-    block: Annotated[float, Gt(0)] = 0.05  # s
-    start_timeout_s: Annotated[float, Gt(0)] = 10.0  # s to the first block; later the device is waited for for ever
+    carrier: Annotated[float, Ge(bounds.CARRIER[0]), Le(bounds.CARRIER[1])] = 24.125e9  # Hz
+    block: Annotated[float, Ge(1e-3), Le(10)] = 0.05  # s
+    start_timeout_s: Time = 10.0  # s to the first block; later the device is waited for for ever
 
     def __post_init__(self) -> None:
         if self.quadrature == self.channel:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal, TypeAlias
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
+from caneflow.algorithms.quantities import MagneticField, Time
 from caneflow.messages import Imu
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.mounting import mounting
@@ -44,16 +45,20 @@ class Mpu9250Settings:
 
     __pydantic_config__ = {"extra": "forbid"}
 
-    bus: Annotated[int, Ge(0)] = 1  # /dev/i2c-N
+    bus: Annotated[int, Ge(0), Le(255)] = 1  # /dev/i2c-N
     address: Annotated[int, Ge(0x68), Le(0x69)] = 0x68  # 0x69 with AD0 high
     rate: Annotated[float, Ge(4), Le(1000)] = 100.0  # Hz; the magnetometer has 100 at most
     gyro_range: Literal[250, 500, 1000, 2000] = 1000  # deg/s
     accel_range: Literal[2, 4, 8, 16] = 8  # g
     bandwidth: Literal[184, 92, 41, 20, 10, 5] = 41  # Hz, of the chip's low-pass filters
     magnetometer: bool = True
-    mag_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # uT, body: what steel on the belt adds; is taken off
+    mag_offset: tuple[MagneticField, MagneticField, MagneticField] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # uT, body: what steel on the belt adds; is taken off
     axes: str = "+x+y+z"  # the chip's axes (gyro's and accelerometer's) that are the body's x, y, z
-    start_timeout_s: Annotated[float, Gt(0)] = 10.0  # s to the first sample; later the chip is waited for for ever
+    start_timeout_s: Time = 10.0  # s to the first sample; later the chip is waited for for ever
 
     def __post_init__(self) -> None:
         try:

@@ -14,10 +14,11 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, TypeVar
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from caneflow.algorithms.clock_fit import ClockFit
-from caneflow.messages import RadarFrame
+from caneflow.algorithms.quantities import Time
+from caneflow.messages import RadarFrame, bounds
 from caneflow.protocols import mrm
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.mrm import RadarConfig, ScanInfo
@@ -68,15 +69,17 @@ class P440Settings:
     device: str = "/dev/ttyACM0"  # serial port of a radar on USB or UART
     scan_start_ps: Picoseconds = 10_000  # ps after the pulse, antenna path included
     scan_stop_ps: Picoseconds = 39_297  # ps; the radar rounds the window up to a multiple of 96 bins of 61.035 ps
-    scan_period_us: Annotated[int, Ge(0), Le(2**32 - 1)] = 10_000  # us between scans; 0: back to back
+    scan_period_us: Annotated[int, Ge(0), Le(60_000_000)] = 10_000  # us between scans; 0: back to back
     integration_index: Annotated[int, Ge(6), Le(15)] = 11  # 2^index pulses are summed in a bin
     code_channel: Annotated[int, Ge(0), Le(10)] = 6
     transmit_gain: Annotated[int, Ge(0), Le(63)] = 63  # 0..63; the regulator may ask for less
     antennas: Literal["a", "b", "a_to_b", "b_to_a"] = "a_to_b"  # transmits by the first, receives by the last
     antenna_delay_ps: Annotated[int, Ge(0), Le(100_000)] = 10_000  # ps of path in the antennas, both ways
-    carrier: Annotated[float, Gt(0)] = 4.3e9  # Hz, effective centre of the received band
-    bandwidth: Annotated[float, Gt(0)] = 1.7e9  # Hz, at -10 dB
-    silence_s: Annotated[float, Gt(0)] = 0.5  # s without a packet after which the radar is started anew
+    carrier: Annotated[float, Ge(bounds.CARRIER[0]), Le(bounds.CARRIER[1])] = (
+        4.3e9  # Hz, effective centre of the received band
+    )
+    bandwidth: Annotated[float, Ge(bounds.BANDWIDTH[0]), Le(bounds.BANDWIDTH[1])] = 1.7e9  # Hz, at -10 dB
+    silence_s: Time = 0.5  # s without a packet after which the radar is started anew
 
     def __post_init__(self) -> None:
         if self.scan_stop_ps <= self.scan_start_ps:

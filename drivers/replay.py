@@ -7,8 +7,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, TypeAlias
 
 import msgspec
+from annotated_types import Ge, Le
 
 from caneflow.messages import MessageError, Sample, decode
 from caneflow.recording import Recording
@@ -17,17 +19,19 @@ from caneflow.runtime.node import run
 
 SLICE = 0.05  # s: while it waits, the replayer says this often that nothing has come
 
+Duration: TypeAlias = Annotated[float, Ge(0), Le(1e10)]  # s: three centuries
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaySettings:
     """Which part of a recording to play, and how fast."""
 
     recording: str  # path
-    speed: float | None = 1.0  # times real time; None: as fast as the readers can
-    origin_ns: int  # the stamp at which the whole replay begins, the same for every node
-    duration_s: float | None = None  # s, from the origin
-    loop_s: float | None = None  # s of one turn; None: play once
-    started_s: float | None = None  # s of the machine's monotonic clock at the origin; None: when it is started
+    speed: Annotated[float, Ge(1e-3), Le(1e6)] | None = 1.0  # times real time; None: as fast as the readers can
+    origin_ns: Annotated[int, Ge(0), Le(2**63 - 1)]  # the stamp at which the whole replay begins, for every node
+    duration_s: Duration | None = None  # s, from the origin
+    loop_s: Duration | None = None  # s of one turn; None: play once
+    started_s: Duration | None = None  # s of the machine's monotonic clock at the origin; None: when it is started
 
 
 class Replay(Source):

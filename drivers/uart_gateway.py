@@ -20,11 +20,12 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal, Protocol
 
 import msgspec
-from annotated_types import Gt
+from annotated_types import Ge, Le
 
 from caneflow.algorithms.clock_fit import ClockFit, ClockFitSettings
 from caneflow.algorithms.luenberger import LuenbergerSettings
 from caneflow.algorithms.luenberger_fixed import observer_constants
+from caneflow.algorithms.quantities import Milliseconds, Time
 from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, Sample, decode, encode
 from caneflow.protocols import uart_frames
 from caneflow.protocols.errors import ProtocolError
@@ -52,10 +53,10 @@ class UartGatewaySettings:
     method: Literal["luenberger_fixed"] = "luenberger_fixed"  # as in fusion, so that one can stand for the other
     luenberger: LuenbergerSettings = field(default_factory=LuenbergerSettings)
     port: str = "/dev/ttyACM0"  # or a URL of pyserial, e.g. socket://host:port
-    baud: Annotated[int, Gt(0)] = 921_600
-    answer_timeout_ms: Annotated[float, Gt(0)] = 100.0  # ms after which a sample is sent again
-    give_up_s: Annotated[float, Gt(0)] = 2.0  # s without an answer after which there is no microcontroller
-    start_timeout_s: Annotated[float, Gt(0)] = 10.0  # s, likewise at the start
+    baud: Annotated[int, Ge(1200), Le(12_000_000)] = 921_600
+    answer_timeout_ms: Milliseconds = 100.0  # ms after which a sample is sent again
+    give_up_s: Time = 2.0  # s without an answer after which there is no microcontroller
+    start_timeout_s: Time = 10.0  # s, likewise at the start
 
     def __post_init__(self) -> None:
         observer_constants(self.luenberger, (0.0, 1.0, 0.0))  # raises for what fixed point does not have

@@ -5,12 +5,10 @@ out  target : DopplerTarget   one per hop of 50 ms (a longer block gives one), o
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated
-
-from annotated_types import Gt
 
 from caneflow.algorithms.doppler_line import DopplerLineSettings, predominant_line, range_from_strength
 from caneflow.algorithms.doppler_spectrum import DopplerSpectrumSettings, SlidingSpectrum
+from caneflow.algorithms.quantities import RangeCalibration
 from caneflow.messages import DopplerBlock, DopplerTarget, MessageError, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused
@@ -24,7 +22,7 @@ class DopplerSettings:
     __pydantic_config__ = {"extra": "forbid"}
 
     sensor: str | None = None  # its name in the rig, whose k gives the range
-    k: Annotated[float, Gt(0)] | None = None  # m^4, instead of the rig's
+    k: RangeCalibration | None = None  # m^4, instead of the rig's
     spectrum: DopplerSpectrumSettings = field(default_factory=DopplerSpectrumSettings)
     line: DopplerLineSettings = field(default_factory=DopplerLineSettings)
 

@@ -13,12 +13,12 @@ stand, `without:west` when the sensor `west` has fallen silent; it is absent whe
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
-from annotated_types import Ge, Gt
 
 from caneflow.algorithms.dead_reckoning import heading_of
+from caneflow.algorithms.quantities import Component, Length, Time, Zero
 from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
 from caneflow.algorithms.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
 from caneflow.algorithms.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor
@@ -53,11 +53,11 @@ class RoomTrackerSettings:
     __pydantic_config__ = {"extra": "forbid"}
 
     method: Method = "best"
-    period: Annotated[float, Gt(0)] = 0.05  # s between poses
-    forward: tuple[float, float, float] = (1.0, 0.0, 0.0)  # the way the person faces, in the IMU's axes
+    period: Time = 0.05  # s between poses
+    forward: tuple[Component, Component, Component] = (1.0, 0.0, 0.0)  # the way the person faces, in the IMU's axes
     standing: StandingSettings = field(default_factory=worn_on_a_belt)
-    cane_ahead: Annotated[float, Ge(0)] = 0.55  # m, of the cane's sensors in front of the person
-    silent_after: Annotated[float, Gt(0)] = 0.5  # s without a sample, after which a sensor counts as silent
+    cane_ahead: Length | Zero = 0.55  # m, of the cane's sensors in front of the person
+    silent_after: Time = 0.5  # s without a sample, after which a sensor counts as silent
     particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
     heading_particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
     ekf: RoomEkfSettings = field(default_factory=plain)

@@ -40,7 +40,7 @@ def test_the_radars_default_window_is_480_bins() -> None:
     [
         ("bno055", {"baud": 9600}, "settings.baud: is 9600; it takes one of 115200"),
         ("bno055", {"mode": "amg"}, "settings.mode: is 'amg'; it takes one of ndof, imu"),
-        ("bno055", {"rate": 200}, "settings.rate: is 200; it takes a number, above 0 and at most 100"),
+        ("bno055", {"rate": 200}, "settings.rate: is 200; it takes a number, at least 0.01 and at most 100"),
         (
             "p440",
             {"scan_start_ps": -500_000},
@@ -56,7 +56,7 @@ def test_the_radars_default_window_is_480_bins() -> None:
             {"scan_stop_ps": 10_000},
             "settings.scan_stop_ps: is 10000; the scan stops after it starts, at 10000",
         ),
-        ("p440", {"carrier": "4.3 GHz"}, "settings.carrier: is '4.3 GHz'; it takes a number, above 0"),
+        ("p440", {"carrier": "4.3 GHz"}, "settings.carrier: is '4.3 GHz'; it takes a number, at least 1000000"),
     ],
 )
 def test_settings_that_the_device_does_not_have_are_mistakes(name: str, settings: dict[str, object], said: str) -> None:

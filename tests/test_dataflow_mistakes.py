@@ -123,7 +123,8 @@ nodes:
         lines[0]
         == "2:1: colour: unknown key; allowed are flow, insecure, links, machines, nodes, results, rig, router, seed"
     )
-    assert lines[1] == "3:42: rig.hand_height: is 'tall'; it takes a number, above 0 (m, of the hand above ground)"
+    about = "it takes a number, at least 0.01 and at most 10 (m, of the hand above ground)"
+    assert lines[1] == f"3:42: rig.hand_height: is 'tall'; {about}"
     assert re.match(r"5:14: nodes\.imu\.run: no program 'drivers\.nosuch' in .*drivers.*operators; ", lines[2])
     assert "there are drivers.bno055, drivers.doppler_adc" in lines[2]
     assert lines[3].startswith("6:30: nodes.radar.restarts: unknown key; did you mean 'restart'? allowed are ext")
@@ -214,7 +215,7 @@ ONE_MISTAKE = {
     "age": (
         "frame: radar/frame",
         "frame: {from: radar/frame, max_age_ms: 0}",
-        "5:74: nodes.speed.inputs.frame.max_age_ms: is 0; it takes a number, above 0 (ms, live: ",
+        "5:74: nodes.speed.inputs.frame.max_age_ms: is 0; it takes a number, at least 0.1 and at most 3600000 (ms",
     ),
     "input without its writer": (
         "frame: radar/frame",
@@ -234,7 +235,7 @@ ONE_MISTAKE = {
     "too patient": (
         "run: drivers.bno055",
         "run: drivers.bno055, ready_timeout_s: .inf",
-        "3:47: nodes.imu.ready_timeout_s: is Infinity; it takes a number, above 0 and at most 3600 (s from its ",
+        "3:47: nodes.imu.ready_timeout_s: is Infinity; it takes a number, at least 0.1 and at most 3600 (s from its ",
     ),
     "text for a number": (
         "run: fuse.py",

@@ -96,7 +96,7 @@ def test_json_has_the_same_in_parts(file: Path) -> None:
             "line": None,
             "column": None,
             "path": "nodes.imu.settings.rate",
-            "text": "is 500; it takes a number, above 0 and at most 100",
+            "text": "is 500; it takes a number, at least 0.01 and at most 100",
         }
     ]
 
@@ -107,7 +107,9 @@ def test_a_rig_is_checked_with_the_file(file: Path, tmp_path: Path) -> None:
     assert called(check, str(file), "--rig", str(rig))[0] == 0
 
     rig.write_text("hand_height: -0.9\n")
-    with pytest.raises(DataflowError, match=r"rig\.yaml:1:14: hand_height: is -0\.9; it takes a number, above 0"):
+    with pytest.raises(
+        DataflowError, match=r"rig\.yaml:1:14: hand_height: is -0\.9; it takes a number, at least 0\.01"
+    ):
         called(check, str(file), "--rig", str(rig))
 
 

@@ -5,9 +5,10 @@ import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
+from annotated_types import Ge, Le
 
 from caneflow.messages import Pose, Sample, sample_key
 from caneflow.recording import Recorded, Recording, RecordingError, RecordingWriter
@@ -20,6 +21,8 @@ WRITE_NOW = b"write now"  # the one question that it answers
 
 log = logging.getLogger(__name__)
 
+Duration: TypeAlias = Annotated[float, Ge(1e-3), Le(1e10)]  # s: three centuries
+
 
 @dataclass(frozen=True, kw_only=True)
 class RecordSettings:
@@ -30,10 +33,10 @@ class RecordSettings:
     source: Literal["live", "replayed"]
     rig: dict[str, Any]
     truth_from: str | None = None  # a replayed recording whose ground truth is carried over
-    rotate_bytes: int | None = None  # a new file when this one is as large
-    rotate_s: float | None = None  # s, a new file after this long
-    keep: int | None = None  # files; older ones of this run are removed
-    last_s: float | None = None  # s that are kept in memory, to be written when somebody asks; nothing else is
+    rotate_bytes: Annotated[int, Ge(1), Le(2**63 - 1)] | None = None  # a new file when this one is as large
+    rotate_s: Duration | None = None  # s, a new file after this long
+    keep: Annotated[int, Ge(1), Le(10**9)] | None = None  # files; older ones of this run are removed
+    last_s: Duration | None = None  # s that are kept in memory, to be written when somebody asks; nothing else is
     run: str | None = None  # the id of the run, the same in all its parts; None: a new one
     goes_on: bool = False  # in the place of a recorder that has ended: what that one wrote is left alone
 

@@ -26,6 +26,9 @@ from caneflow.runtime.hosts.nursery import Nursery
 from caneflow.runtime.hosts.open_files import raise_limit, require_open_files
 from caneflow.runtime.wording import listed
 
+SLOWEST, FASTEST = 1e-3, 1e6  # times real time: 17 min for a second; a year in half a minute, faster than any computer
+LONGEST = 1e9  # s: 32 years
+
 
 def command(
     file: Annotated[Path, typer.Argument(help="the dataflow, e.g. dataflow.yaml")],
@@ -37,9 +40,11 @@ def command(
         typer.Option(metavar="X|max", help="of the replay, in times real time [default: 1; in-process: max]"),
     ] = None,
     start: Annotated[
-        float, typer.Option(metavar="S", min=0, help="s into the recording at which the replay begins")
+        float, typer.Option(metavar="S", min=0, max=LONGEST, help="s into the recording at which the replay begins")
     ] = 0.0,
-    duration: Annotated[float | None, typer.Option(metavar="S", min=0, help="s of the recording to play")] = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", min=0, max=LONGEST, help="s of the recording to play")
+    ] = None,
     loop: Annotated[bool, typer.Option("--loop", help="begin again at the end, with stamps that go on")] = False,
     without: Annotated[
         list[str] | None, typer.Option(metavar="NODE", help="leave this node out (may be given again)")
@@ -223,8 +228,10 @@ def _speed(text: str) -> float:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not (0 < value < math.inf):
-        raise DataflowError(f"--speed {text}: is no speed; give times real time, e.g. 1 or 2.5, or max")
+    if not SLOWEST <= value <= FASTEST:
+        raise DataflowError(
+            f"--speed {text}: is no speed; give times real time, {SLOWEST:g} to {FASTEST:g}, e.g. 1 or 2.5, or max"
+        )
     return value
 
 

@@ -14,9 +14,6 @@ World: x east, y magnetic north, z up.
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated
-
-from annotated_types import Gt
 
 from caneflow.algorithms.dead_reckoning import LONGEST_INTERVAL, SampleClock
 from caneflow.algorithms.gyro_bias import (
@@ -31,6 +28,7 @@ from caneflow.algorithms.gyro_bias import (
 )
 from caneflow.algorithms.initial_attitude import AttitudeEstimate, level, required_start
 from caneflow.algorithms.magnetic_heading import MagneticHeading, MagneticHeadingSettings
+from caneflow.algorithms.quantities import Time
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,
@@ -49,7 +47,7 @@ LEAST_FORCE = 1.0  # m/s^2; a mean specific force below is free fall, or no acce
 class AttitudeFilterSettings:
     """How long motion is averaged over; the magnetometer; the gyro's bias."""
 
-    inclination_time: Annotated[float, Gt(0)] = 3.0  # s, delay of the low pass of the specific force
+    inclination_time: Time = 3.0  # s, delay of the low pass of the specific force
     heading: MagneticHeadingSettings = field(default_factory=MagneticHeadingSettings)
     bias: GyroBiasSettings = field(default_factory=GyroBiasSettings)
 

@@ -8,10 +8,9 @@ import cmath
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Annotated, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from caneflow.algorithms.dead_reckoning import (
@@ -25,6 +24,7 @@ from caneflow.algorithms.dead_reckoning import (
 from caneflow.algorithms.gyro_yaw import GyroYaw
 from caneflow.algorithms.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
+from caneflow.algorithms.quantities import Density, Factor, Fraction, Length, Offset, Speed, Time, Zero
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized, rotate
 from caneflow.algorithms.standing import StandingDetector, StandingSettings
 from caneflow.algorithms.walk_motion import WalkMotion, WalkMotionSettings
@@ -36,23 +36,23 @@ class CaneFilterSettings:
 
     # s over which radar velocities err alike (their window, and the speckle they stand on): as white noise, those
     # that come more often are worth less each
-    velocity_correlation: Annotated[float, Gt(0)] = 0.04
-    speed_noise: Annotated[float, Gt(0)] = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
-    speed_patience: Annotated[float, Gt(0)] = 0.5  # s without a velocity before the paper's speed is taken instead
-    sideways: Annotated[float, Gt(0)] = 0.1  # m/s, sd of the hand's velocity across the way the cane points
-    sideways_interval: Annotated[float, Gt(0)] = 0.1  # s
-    sideways_memory: Annotated[float, Gt(0)] = 1.0  # s over which swinging and turning are noticed
-    sideways_per_turn: Annotated[float, Ge(0)] = 0.3  # m: (m/s) of doubt per (rad/s) of swinging or turning
-    hand_ahead: float = 0.3  # m that the hand is carried ahead of the body: it goes sideways when the body turns
-    standing_speed: Annotated[float, Gt(0)] = 0.03  # m/s, sd of the sensors' while the bearer stands
-    standing_inflation: Annotated[float, Gt(0)] = 20.0  # samples that share one drift of the hand
-    radar_standing: Annotated[float, Gt(0)] = 0.2  # m/s, radar speed above which nobody stands, whatever the IMU says
-    speed_scale: Annotated[float, Ge(0)] = 0.012  # sd of the radar's scale: 1 cm of height; only in the covariance
+    velocity_correlation: Time = 0.04
+    speed_noise: Density = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
+    speed_patience: Time = 0.5  # s without a velocity before the paper's speed is taken instead
+    sideways: Speed = 0.1  # m/s, sd of the hand's velocity across the way the cane points
+    sideways_interval: Time = 0.1  # s
+    sideways_memory: Time = 1.0  # s over which swinging and turning are noticed
+    sideways_per_turn: Length | Zero = 0.3  # m: (m/s) of doubt per (rad/s) of swinging or turning
+    hand_ahead: Offset = 0.3  # m that the hand is carried ahead of the body: it goes sideways when the body turns
+    standing_speed: Speed = 0.03  # m/s, sd of the sensors' while the bearer stands
+    standing_inflation: Factor = 20.0  # samples that share one drift of the hand
+    radar_standing: Time = 0.2  # m/s, radar speed above which nobody stands, whatever the IMU says
+    speed_scale: Fraction | Zero = 0.012  # sd of the radar's scale: 1 cm of height; only in the covariance
     # What is given out of the horizontal covariance: in 50 simulated walks errors were that much smaller (best.md).
-    covariance_share: Annotated[float, Gt(0)] = 0.8
-    heading_interval: Annotated[float, Gt(0)] = 0.1  # s between updates of the tracks
+    covariance_share: Factor = 0.8
+    heading_interval: Time = 0.1  # s between updates of the tracks
     # s in which the track follows a correction: a person does not jump by millimetres twenty times a second
-    correction_time: Annotated[float, Gt(0)] = 0.3
+    correction_time: Time = 0.3
     standing: StandingSettings = field(default_factory=StandingSettings)
     motion: WalkMotionSettings = field(default_factory=WalkMotionSettings)
     heading: HeadingSettings = field(default_factory=HeadingSettings)

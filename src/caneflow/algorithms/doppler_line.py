@@ -6,12 +6,11 @@ direct path (Ferrand et al., ICCHP 2020). Positive frequency is approaching, so 
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
 
 from caneflow.algorithms.doppler_spectrum import DopplerSpectrum
+from caneflow.algorithms.quantities import Decibels, Frequency, Probability, Zero
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 LOWEST_SNR = -99.0  # dB, of a spectrum with nothing in it
@@ -21,9 +20,9 @@ LOWEST_SNR = -99.0  # dB, of a spectrum with nothing in it
 class DopplerLineSettings:
     """When a peak counts as a person (room.md row 10)."""
 
-    least_snr: Annotated[float, Ge(0)] = 10.0  # dB over the noise floor
-    least_share: Annotated[float, Ge(0), Le(1)] = 0.25  # of the in-band energy above the floor
-    half_width: Annotated[float, Gt(0)] = 8.0  # Hz to either side, that the share is taken from
+    least_snr: Decibels | Zero = 10.0  # dB over the noise floor
+    least_share: Probability = 0.25  # of the in-band energy above the floor
+    half_width: Frequency = 8.0  # Hz to either side, that the share is taken from
 
 
 @dataclass(frozen=True, kw_only=True)

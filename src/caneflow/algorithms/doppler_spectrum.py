@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from scipy import fft, ndimage
+
+from caneflow.algorithms.quantities import Frequency, Time, Zero
 
 INT16_FULL_SCALE = 32768.0
 SMOOTHING = 0.95  # per hop, of the spectrum whose minimum is taken: 1 s at the hop of 50 ms
@@ -31,12 +33,12 @@ LEAST_POWER = 1e-16  # of full scale: far below the last bit of any converter
 class DopplerSpectrumSettings:
     """Window, hop, band (room.md row 8), and how long the floor's minimum looks back."""
 
-    window: Annotated[float, Gt(0)] = 0.256  # s, Hann
-    hop: Annotated[float, Gt(0)] = 0.05  # s between spectra; a block that is longer gives one all the same
-    padding: Annotated[float, Ge(1)] = 2.0  # length of the transform in windows
-    lowest: Annotated[float, Ge(0)] = 8.0  # Hz
-    highest: Annotated[float, Gt(0)] = 560.0  # Hz
-    floor_memory: Annotated[float, Gt(0)] = 20.0  # s
+    window: Annotated[float, Ge(1e-3), Le(60)] = 0.256  # s, Hann
+    hop: Annotated[float, Ge(1e-3), Le(60)] = 0.05  # s between spectra; a block that is longer gives one all the same
+    padding: Annotated[float, Ge(1), Le(64)] = 2.0  # length of the transform in windows
+    lowest: Frequency | Zero = 8.0  # Hz
+    highest: Frequency = 560.0  # Hz
+    floor_memory: Time = 20.0  # s
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

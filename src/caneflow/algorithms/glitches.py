@@ -9,8 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Generic, NamedTuple, TypeVar
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
+from caneflow.algorithms.quantities import Acceleration, Angle, Time, TurnRate
 from caneflow.algorithms.rotations import Quaternion, Vector
 
 V = TypeVar("V")
@@ -20,12 +21,12 @@ V = TypeVar("V")
 class GlitchSettings:
     """How far a reading may be from the last good one; measured to cancel single wild ones and touch no walk."""
 
-    acceleration: Annotated[float, Gt(0), Le(1e4)] = 10.0  # m/s^2
-    turn_rate: Annotated[float, Gt(0), Le(1e3)] = math.radians(120.0)  # rad/s
-    field: Annotated[float, Gt(0), Le(1e5)] = 60.0  # uT
-    rotation: Annotated[float, Gt(0), Le(math.pi)] = math.radians(10.0)  # rad, between two attitudes
+    acceleration: Acceleration = 10.0  # m/s^2
+    turn_rate: TurnRate = math.radians(120.0)  # rad/s
+    field: Annotated[float, Ge(1e-3), Le(1e5)] = 60.0  # uT
+    rotation: Angle = math.radians(10.0)  # rad, between two attitudes
     most_held: Annotated[int, Ge(0), Le(1000)] = 3  # samples; what lasts longer is no glitch
-    longest_gap: Annotated[float, Gt(0), Le(10.0)] = 0.05  # s; across a longer one anything may have happened
+    longest_gap: Time = 0.05  # s; across a longer one anything may have happened
 
 
 class JumpGate(Generic[V]):

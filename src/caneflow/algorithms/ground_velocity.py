@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
@@ -23,6 +23,18 @@ from caneflow.algorithms.footprint import CaneGeometry, antenna_height, pitch
 from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
 from caneflow.algorithms.moving_returns import MovingReturns
 from caneflow.algorithms.pulse_pairs import PulsePairWindow
+from caneflow.algorithms.quantities import (
+    Density,
+    Elevation,
+    Factor,
+    Fraction,
+    Length,
+    OpenFraction,
+    Speed,
+    Time,
+    TurnRate,
+    Zero,
+)
 from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 from caneflow.algorithms.rotations import Quaternion, Vector, rotate
 
@@ -40,24 +52,24 @@ _HEAVES: Final = 64  # IMU samples that a window's middle may lie back
 class GroundVelocitySettings:
     """What the pulse pair may be told."""
 
-    window: Annotated[int, Ge(2)] = 5  # pairs of scans in a sum
-    every: Annotated[int, Ge(1)] = 5  # frames from one estimate to the next: windows that overlap err alike
-    cell: Annotated[float, Gt(0)] = 0.075  # m of range in a sum: the pulse is 0.09 m long
-    shallowest: Annotated[float, Gt(0)] = math.radians(16)  # rad, grazing angle
-    steepest: Annotated[float, Lt(math.pi / 2)] = math.radians(75)  # rad
-    beam_share: Annotated[float, Gt(0)] = 0.7  # of the aperture, to either side of the boresight, that is looked at
-    fewest_cells: Annotated[int, Ge(3)] = 5
-    looks: Annotated[float, Gt(0)] = 2.75  # independent ones per cell and window: its 40 samples share one speckle
-    outlier: Annotated[float, Gt(0)] = 0.3  # rad of phase, from which on a cell loses its weight: walls, people
-    least_fit: Annotated[float, Gt(0), Lt(1)] = 0.3  # coherence of all cells with the fit that counts as ground seen
-    alias_share: Annotated[float, Gt(0), Le(1)] = 0.9  # of the unambiguous radial speed up to which a fit counts
-    vertical_speed: Annotated[float, Gt(0)] = 0.12  # m/s, sd without an accelerometer: a bob of 12 mm at 1.1 Hz
-    heave_error: Annotated[float, Gt(0)] = 0.02  # m/s, sd of the vertical speed with one
-    height_error: Annotated[float, Gt(0)] = 0.03  # m, sd of a person's hand about the rig's height
-    height_walk: Annotated[float, Ge(0)] = 0.002  # m / sqrt(s)
-    height_time: Annotated[float, Gt(0)] = 0.5  # s that tell the height as much as one estimate would by itself
-    rest_turn_rate: Annotated[float, Gt(0)] = math.radians(5.0)  # rad/s, mean norm, below which nothing seen is rest
-    rest_speed: Annotated[float, Gt(0)] = 0.03  # m/s, sd of the antenna's then: drift and tremor of a hand
+    window: Annotated[int, Ge(2), Le(1000)] = 5  # pairs of scans in a sum
+    every: Annotated[int, Ge(1), Le(1000)] = 5  # frames from one estimate to the next: windows that overlap err alike
+    cell: Length = 0.075  # m of range in a sum: the pulse is 0.09 m long
+    shallowest: Elevation = math.radians(16)  # rad, grazing angle
+    steepest: Elevation = math.radians(75)  # rad
+    beam_share: Factor = 0.7  # of the aperture, to either side of the boresight, that is looked at
+    fewest_cells: Annotated[int, Ge(3), Le(1000)] = 5
+    looks: Factor = 2.75  # independent ones per cell and window: its 40 samples share one speckle
+    outlier: Speed = 0.3  # rad of phase, from which on a cell loses its weight: walls, people
+    least_fit: OpenFraction = 0.3  # coherence of all cells with the fit that counts as ground seen
+    alias_share: Fraction = 0.9  # of the unambiguous radial speed up to which a fit counts
+    vertical_speed: Speed = 0.12  # m/s, sd without an accelerometer: a bob of 12 mm at 1.1 Hz
+    heave_error: Speed = 0.02  # m/s, sd of the vertical speed with one
+    height_error: Length = 0.03  # m, sd of a person's hand about the rig's height
+    height_walk: Density | Zero = 0.002  # m / sqrt(s)
+    height_time: Time = 0.5  # s that tell the height as much as one estimate would by itself
+    rest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm, below which nothing seen is rest
+    rest_speed: Speed = 0.03  # m/s, sd of the antenna's then: drift and tremor of a hand
     heave: HeaveSettings = field(default_factory=HeaveSettings)
 
     def __post_init__(self) -> None:

@@ -11,10 +11,9 @@ After VQF's (D. Laidig, T. Seel, Information Fusion 91, 2023), simplified.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import TypeAlias
 
-from annotated_types import Ge, Gt
-
+from caneflow.algorithms.quantities import Acceleration, Density, Factor, Time, TurnRate, Zero
 from caneflow.algorithms.rotations import Quaternion, Vector
 
 # A row of H, and the turn rate (rad/s) about that axis of the world that was taken off as bias; both low-passed.
@@ -29,18 +28,18 @@ INTERVAL = 0.1  # s that are gathered for one correction
 class GyroBiasSettings:
     """How large a bias may be, and what counts as rest."""
 
-    largest: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/s per axis; a slower steady turn passes for rest
-    initial: Annotated[float, Gt(0)] = math.radians(0.5)  # rad/s, sd per axis before anything was seen
-    walk: Annotated[float, Gt(0)] = math.radians(0.01)  # rad/s/sqrt(s): 0.1 deg/s in 100 s
+    largest: TurnRate = math.radians(2.0)  # rad/s per axis; a slower steady turn passes for rest
+    initial: TurnRate = math.radians(0.5)  # rad/s, sd per axis before anything was seen
+    walk: Density = math.radians(0.01)  # rad/s/sqrt(s): 0.1 deg/s in 100 s
     # sd of a measurement over 1 s:
-    rest_noise: Annotated[float, Gt(0)] = math.radians(0.05)  # rad/s, at rest, beside what follows
-    sway: Annotated[float, Ge(0)] = 4.0  # times the gyro's own deviations at rest: a hand that is still is not quite
-    tilt_noise: Annotated[float, Gt(0)] = math.radians(1.0)  # rad/s, of a correction by gravity
-    heading_noise: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/s, of a correction by magnetic north
-    rest_gyro: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/s, largest deviation from the mean at rest
-    rest_accel: Annotated[float, Gt(0)] = 0.5  # m/s^2, likewise
-    rest_time: Annotated[float, Gt(0)] = 1.5  # s that it must last
-    rest_memory: Annotated[float, Gt(0)] = 0.5  # s, of that mean
+    rest_noise: Density = math.radians(0.05)  # rad/s, at rest, beside what follows
+    sway: Factor | Zero = 4.0  # times the gyro's own deviations at rest: a hand that is still is not quite
+    tilt_noise: Density = math.radians(1.0)  # rad/s, of a correction by gravity
+    heading_noise: Density = math.radians(2.0)  # rad/s, of a correction by magnetic north
+    rest_gyro: TurnRate = math.radians(2.0)  # rad/s, largest deviation from the mean at rest
+    rest_accel: Acceleration = 0.5  # m/s^2, likewise
+    rest_time: Time = 1.5  # s that it must last
+    rest_memory: Time = 0.5  # s, of that mean
 
 
 class RestDetector:

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt, MultipleOf
+from annotated_types import Ge, Le, Len, MultipleOf
 from numpy.typing import NDArray
+
+from caneflow.algorithms.quantities import Angle, Fraction, Length, Time, TurnRate
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -32,19 +34,25 @@ _TOO_FEW: Final = 4.0  # biases that carry the weight: fewer, and the grid is to
 class HeadingSettings:
     """What is believed of gyro and field before a walk."""
 
-    biases: Annotated[int, Ge(5)] = 21  # hypotheses of the gyro's bias, three scale errors each
-    largest_bias: Annotated[float, Gt(0)] = 0.8 * _DEGREE  # rad/s
+    biases: Annotated[int, Ge(5), Le(1001)] = 21  # hypotheses of the gyro's bias, three scale errors each
+    largest_bias: TurnRate = 0.8 * _DEGREE  # rad/s
     # rad/s, sd of a gyro's bias (cane.md: 0.02 to 0.3 deg/s); all equally likely, gravity's axes tell which it is
-    bias_spreads: tuple[float, ...] = (0.025 * _DEGREE, 0.05 * _DEGREE, 0.1 * _DEGREE, 0.2 * _DEGREE, 0.4 * _DEGREE)
-    scale_error: Annotated[float, Gt(0)] = 0.007  # sd of the gyro's scale (cane.md)
-    knot_interval: Annotated[float, Gt(0)] = 1.0  # s
-    knots: Annotated[int, Ge(8), MultipleOf(2)] = 64  # kept; when full, every second one goes
-    field_error: Annotated[float, Gt(0)] = 14.0 * _DEGREE  # rad, sd of the field's direction indoors
-    field_scale: Annotated[float, Gt(0)] = 1.8  # m over which it changes (cane.md: 10 deg over 2 m)
-    rough_error: Annotated[float, Gt(0)] = 3.0 * _DEGREE  # rad, sd of what changes over shorter ways
-    rough_scale: Annotated[float, Gt(0)] = 0.5  # m
-    field_noise: Annotated[float, Gt(0)] = 0.8 * _DEGREE  # rad, sd of a knot's average: mostly of tilt
-    chip_noise: Annotated[float, Gt(0)] = 4.0 * _DEGREE  # rad, where the chip's yaw stands in for the field: it lags
+    bias_spreads: Annotated[tuple[TurnRate, ...], Len(1, 32)] = (
+        0.025 * _DEGREE,
+        0.05 * _DEGREE,
+        0.1 * _DEGREE,
+        0.2 * _DEGREE,
+        0.4 * _DEGREE,
+    )
+    scale_error: Fraction = 0.007  # sd of the gyro's scale (cane.md)
+    knot_interval: Time = 1.0  # s
+    knots: Annotated[int, Ge(8), Le(1024), MultipleOf(2)] = 64  # kept; when full, every second one goes
+    field_error: Angle = 14.0 * _DEGREE  # rad, sd of the field's direction indoors
+    field_scale: Length = 1.8  # m over which it changes (cane.md: 10 deg over 2 m)
+    rough_error: Angle = 3.0 * _DEGREE  # rad, sd of what changes over shorter ways
+    rough_scale: Length = 0.5  # m
+    field_noise: Angle = 0.8 * _DEGREE  # rad, sd of a knot's average: mostly of tilt
+    chip_noise: Angle = 4.0 * _DEGREE  # rad, where the chip's yaw stands in for the field: it lags
 
 
 class Knot(NamedTuple):

@@ -5,9 +5,8 @@ the nominal height; the accelerometer sees how, the rig sees where. Between them
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from annotated_types import Gt
+from caneflow.algorithms.quantities import Acceleration, Density, Length
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,10 +14,10 @@ class HeaveSettings:
     """Noises of the Kalman filter."""
 
     # the hand's height about the nominal one: 20 mm, correlated over 0.3 s, as white noise at 100 Hz
-    height_noise: Annotated[float, Gt(0)] = 0.11  # m
-    acceleration_noise: Annotated[float, Gt(0)] = 0.02  # m/s^2 / sqrt(Hz), of a sampled swing rather than of the chip
-    bias: Annotated[float, Gt(0)] = 0.1  # m/s^2, sd at the start (BNO055: 0.07)
-    bias_walk: Annotated[float, Gt(0)] = 0.01  # m/s^2 / sqrt(s)
+    height_noise: Length = 0.11  # m
+    acceleration_noise: Density = 0.02  # m/s^2 / sqrt(Hz), of a sampled swing rather than of the chip
+    bias: Acceleration = 0.1  # m/s^2, sd at the start (BNO055: 0.07)
+    bias_walk: Density = 0.01  # m/s^2 / sqrt(s)
 
 
 class HeaveObserver:

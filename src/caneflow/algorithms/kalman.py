@@ -6,10 +6,8 @@ Q and R are the same on every axis, so one covariance of (a, v, p) serves all th
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from caneflow.algorithms.dead_reckoning import (
@@ -22,6 +20,7 @@ from caneflow.algorithms.dead_reckoning import (
     required_orientation,
     world_acceleration,
 )
+from caneflow.algorithms.quantities import Angle, Density, Factor, Fraction, Speed, Time, Zero
 from caneflow.algorithms.rotations import Quaternion, Vector
 
 INITIAL_ACCELERATION = 3.0  # m/s^2, sd before the first sample and after a gap: the swing's own
@@ -32,16 +31,16 @@ INITIAL_VELOCITY = 1.0  # m/s, sd likewise: somewhere between standing and walki
 class KalmanSettings:
     """Q, R and the slow errors; where each number comes from is in docs/methods/kalman.md."""
 
-    acceleration_walk: Annotated[float, Gt(0)] = 8.0  # m/s^2/sqrt(s), Q: the acceleration's own changes
-    velocity_walk: Annotated[float, Ge(0)] = 0.25  # m/s/sqrt(s), Q: what the acceleration does not explain
-    acceleration_noise: Annotated[float, Gt(0)] = 0.1  # m/s^2, R: noise, bias and tilt of the accelerometer
-    speed_noise: Annotated[float, Gt(0)] = 0.5  # m/s, R: white equivalent of a speed correlated over its window
+    acceleration_walk: Density = 8.0  # m/s^2/sqrt(s), Q: the acceleration's own changes
+    velocity_walk: Density | Zero = 0.25  # m/s/sqrt(s), Q: what the acceleration does not explain
+    acceleration_noise: Density = 0.1  # m/s^2, R: noise, bias and tilt of the accelerometer
+    speed_noise: Density = 0.5  # m/s, R: white equivalent of a speed correlated over its window
     noise_from_quality: bool = False  # R of the speed from its quality index q (eq. 4) instead
-    quality_scale: Annotated[float, Gt(0)] = 8.0  # R = (scale max(q, floor))^2; 8 = sqrt(64 scans in a window)
-    quality_floor: Annotated[float, Gt(0)] = 0.05  # m/s
-    heading_error: Annotated[float, Ge(0)] = 0.17  # rad, sd of the chip's yaw; covariance only
-    heading_correlation: Annotated[float, Gt(0)] = 8.0  # s
-    scale_error: Annotated[float, Ge(0)] = 0.05  # relative sd of the speed, constant in a walk; covariance only
+    quality_scale: Factor = 8.0  # R = (scale max(q, floor))^2; 8 = sqrt(64 scans in a window)
+    quality_floor: Speed = 0.05  # m/s
+    heading_error: Angle | Zero = 0.17  # rad, sd of the chip's yaw; covariance only
+    heading_correlation: Time = 8.0  # s
+    scale_error: Fraction | Zero = 0.05  # relative sd of the speed, constant in a walk; covariance only
     compensate_delay: DelayCompensation = "none"
 
 

@@ -7,7 +7,7 @@ import cmath
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from annotated_types import Gt, Lt
+from annotated_types import Ge, Gt, Le, Lt
 
 from caneflow.algorithms.dead_reckoning import (
     LONGEST_INTERVAL,
@@ -18,10 +18,12 @@ from caneflow.algorithms.dead_reckoning import (
     required_orientation,
     world_acceleration,
 )
+from caneflow.algorithms.quantities import Time
 from caneflow.algorithms.rotations import Quaternion, Vector
 
 Pole: TypeAlias = Annotated[float, Gt(-1), Lt(1)]
-Gain: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
+GainElement: TypeAlias = Annotated[float, Ge(-1e4), Le(1e4)]  # of an observer that converges: a few 1 / interval
+Gain: TypeAlias = tuple[tuple[GainElement, GainElement], tuple[GainElement, GainElement]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,7 @@ class LuenbergerSettings:
     pole_acceleration: Pole = 0.5  # per sample, magnitude below 1
     pole_velocity: Pole = 0.95  # per sample, magnitude below 1; 0.98 and above lags visibly
     gain: Gain | None = None  # L itself instead of poles; rows a, v; columns innovation of a, of v
-    interval: Annotated[float, Gt(0)] = 0.01  # s, nominal; only for checking `gain`
+    interval: Time = 0.01  # s, nominal; only for checking `gain`
     compensate_delay: DelayCompensation = "none"
 
     def __post_init__(self) -> None:

@@ -9,12 +9,10 @@ the identity.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
-
-from annotated_types import Ge
 
 from caneflow.algorithms.dead_reckoning import LONGEST_INTERVAL, SampleClock
 from caneflow.algorithms.initial_attitude import AttitudeEstimate, initial_attitude, required_start
+from caneflow.algorithms.quantities import Density, TurnRate, Zero
 from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, multiply, normalized, rotate
 
 Gradient = Quaternion  # of the objective function, by w x y z
@@ -24,8 +22,8 @@ Gradient = Quaternion  # of the objective function, by w x y z
 class MadgwickSettings:
     """The two gains; Madgwick's own values for the MARG array."""
 
-    gain: Annotated[float, Ge(0)] = 0.041  # rad/s, beta: how fast gyro error is corrected (eq. 50)
-    bias_gain: Annotated[float, Ge(0)] = 0.0  # rad/s^2, zeta: how fast the gyro's bias may drift (eq. 51)
+    gain: TurnRate | Zero = 0.041  # rad/s, beta: how fast gyro error is corrected (eq. 50)
+    bias_gain: Density | Zero = 0.0  # rad/s^2, zeta: how fast the gyro's bias may drift (eq. 51)
 
 
 class Madgwick:

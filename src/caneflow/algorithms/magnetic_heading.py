@@ -7,12 +7,10 @@ longer the longer the field was not believed. A disturbed field has `distrust` t
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated
-
-from annotated_types import Gt
 
 from caneflow.algorithms.gyro_bias import NOTHING_SEEN, Row, followed_row
 from caneflow.algorithms.initial_attitude import NORTH_YAW
+from caneflow.algorithms.quantities import Angle, Factor, Time
 from caneflow.algorithms.rotations import Vector, wrapped
 
 SMOOTHING = 0.1  # s, of strength and dip: the magnetometer's noise is no disturbance
@@ -28,11 +26,11 @@ LEAST_LEVEL = 1e-3  # of the field's strength; a field as steep as that has no y
 class MagneticHeadingSettings:
     """How fast the magnetometer corrects yaw, and when it does not."""
 
-    time_constant: Annotated[float, Gt(0)] = 20.0  # s
-    strength_tolerance: Annotated[float, Gt(0)] = 0.1  # relative
-    dip_tolerance: Annotated[float, Gt(0)] = math.radians(10.0)  # rad
-    reference_time: Annotated[float, Gt(0)] = 20.0  # s, over which the undisturbed field is averaged
-    acceptance_time: Annotated[float, Gt(0)] = 20.0  # s of steadiness in turning that make another field the one
+    time_constant: Time = 20.0  # s
+    strength_tolerance: Factor = 0.1  # relative
+    dip_tolerance: Angle = math.radians(10.0)  # rad
+    reference_time: Time = 20.0  # s, over which the undisturbed field is averaged
+    acceptance_time: Time = 20.0  # s of steadiness in turning that make another field the one
 
 
 @dataclass

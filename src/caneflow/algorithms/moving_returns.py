@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from caneflow.algorithms.analytic_signal import AnalyticSignal
 from caneflow.algorithms.background import Background
+from caneflow.algorithms.quantities import Time
 
 LARGEST_SAMPLE = 1e12  # the square of its spectrum still fits a float32
 
@@ -32,8 +33,8 @@ class RadarParameters:
 class MovingReturnsSettings:
     """How the standing picture is removed and how gaps are met."""
 
-    background_time: Annotated[float, Gt(0)] = 0.5  # s, time constant of the running mean (cane.md row 3)
-    longest_gap: Annotated[int, Ge(0)] = 5  # scans that may be missing in a row before all starts anew
+    background_time: Time = 0.5  # s, time constant of the running mean (cane.md row 3)
+    longest_gap: Annotated[int, Ge(0), Le(1000)] = 5  # scans that may be missing in a row before all starts anew
 
 
 class MovingReturns(NamedTuple):

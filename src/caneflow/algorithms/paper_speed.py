@@ -11,13 +11,14 @@ from operator import mul
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
 from caneflow.algorithms.edges import EDGE_BEYOND_SPEED, superior_edges
 from caneflow.algorithms.footprint import NO_RAYS, CaneGeometry, Fan, RayCaster, Rays, antenna_height, pitch
 from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
+from caneflow.algorithms.quantities import Elevation, Factor, Fraction, OpenFraction, Speed, Zero
 from caneflow.algorithms.range_doppler import SlowTimeWindow, hann, speed_per_bin
 from caneflow.algorithms.rest import RestSettings, is_at_rest, peaks_and_floor
 from caneflow.algorithms.rotations import Quaternion
@@ -31,20 +32,20 @@ Average: TypeAlias = Literal["mean", "median", "weighted"]
 class PaperSpeedSettings:
     """What the paper leaves open, and our choice."""
 
-    window: Annotated[int, Ge(8)] = 64  # scans, N (row 4)
-    transform: Annotated[int, Ge(16)] = 256  # Doppler bins, zero-padded from the window
-    rays: Annotated[int, Ge(2)] = 16  # K (row 5)
-    aperture_share: Annotated[float, Gt(0), Le(1)] = 0.8  # of the rig's aperture, that the rays span
-    shallowest: Annotated[float, Gt(0)] = math.radians(18)  # rad, of a ray to the ground
-    steepest: Annotated[float, Lt(math.pi / 2)] = math.radians(80)  # rad
+    window: Annotated[int, Ge(8), Le(8192)] = 64  # scans, N (row 4)
+    transform: Annotated[int, Ge(16), Le(65536)] = 256  # Doppler bins, zero-padded from the window
+    rays: Annotated[int, Ge(2), Le(1024)] = 16  # K (row 5)
+    aperture_share: Fraction = 0.8  # of the rig's aperture, that the rays span
+    shallowest: Elevation = math.radians(18)  # rad, of a ray to the ground
+    steepest: Elevation = math.radians(80)  # rad
     compensate_edge: bool = True  # take off what the edge lies beyond the speed (row 6)
-    edge_beyond_speed: Annotated[float, Ge(0)] = EDGE_BEYOND_SPEED  # resolution cells of the window
+    edge_beyond_speed: Speed | Zero = EDGE_BEYOND_SPEED  # resolution cells of the window
     average: Average = "mean"  # f and g of eq. 3, 4 (row 7); weighted: by the height of a ray's fall
-    agreement: Annotated[float, Gt(0)] = 0.25  # m/s, from the rays' median, within which a ray agrees
-    fewest_rays: Annotated[int, Ge(1)] = 8  # that must agree
-    least_peak: Annotated[float, Gt(0)] = 6.0  # of a ray's Doppler power, in noise floors
-    alias_share: Annotated[float, Gt(0), Le(1)] = 0.9  # of the radial speed limit, up to which an edge counts
-    most_lost: Annotated[float, Ge(0), Lt(1)] = 0.25  # share of a window's scans that may be missing
+    agreement: Speed = 0.25  # m/s, from the rays' median, within which a ray agrees
+    fewest_rays: Annotated[int, Ge(1), Le(1024)] = 8  # that must agree
+    least_peak: Factor = 6.0  # of a ray's Doppler power, in noise floors
+    alias_share: Fraction = 0.9  # of the radial speed limit, up to which an edge counts
+    most_lost: OpenFraction | Zero = 0.25  # share of a window's scans that may be missing
     rest: RestSettings = field(default_factory=RestSettings)
 
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
+from caneflow.algorithms.quantities import Fraction, Length, Zero
 from caneflow.algorithms.resampling import effective_number, systematic
 
 Array = NDArray[np.float64]
@@ -18,8 +19,8 @@ class ParticleSettings:
     """How many particles, when they are resampled and which are removed (room.md row 14)."""
 
     count: Annotated[int, Ge(10), Le(100_000)] = 1000
-    resample_below: Annotated[float, Gt(0), Le(1)] = 0.5  # of the count, effective number
-    smallest: Annotated[float, Ge(0)] = 1e-3  # of the mean weight; lighter particles are removed
+    resample_below: Fraction = 0.5  # of the count, effective number
+    smallest: Length | Zero = 1e-3  # of the mean weight; lighter particles are removed
 
 
 class Particles:

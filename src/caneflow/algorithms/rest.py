@@ -15,8 +15,10 @@ from functools import cache
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Gt
+from annotated_types import Gt, Le
 from numpy.typing import NDArray
+
+from caneflow.algorithms.quantities import TurnRate
 
 # The main lobe of the Hann window reaches 2 cells from zero; half a cell more for the drift of a hand at rest.
 STANDING_CELLS = 2.5  # resolution cells of the window to either side of zero Doppler that count as standing
@@ -28,9 +30,9 @@ class RestSettings:
 
     enabled: bool = True
     # White noise gives 2 to 2.5, at times 3.5; ground at 5 dB that passes at 0.25 m/s gives 14 or more.
-    largest_peak: Annotated[float, Gt(1)] = 7.0  # of the noise floor
+    largest_peak: Annotated[float, Gt(1), Le(1e6)] = 7.0  # of the noise floor
     # A gyro's bias is below 2 deg/s, a still hand turns by 0.5; walking turns the cane by 5 deg/s or more.
-    largest_turn_rate: Annotated[float, Gt(0)] = math.radians(5.0)  # rad/s, mean norm over the window
+    largest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm over the window
 
 
 def peaks_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, float, float]:

@@ -22,6 +22,18 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
+from caneflow.algorithms.quantities import (
+    Angle,
+    Decibels,
+    DegreesOfFreedom,
+    Density,
+    Factor,
+    Fraction,
+    Length,
+    Speed,
+    Time,
+    Zero,
+)
 from caneflow.algorithms.room_tracking import (
     DECIBEL,
     LEAST_DISTANCE,
@@ -47,40 +59,40 @@ class RoomEkfSettings:
     use_strength: bool = True
     use_heading: bool = True
     use_steps: bool = True  # the IMU's steps tell standing from lost; false, or no accelerometer: the sensors must
-    walk_noise: Annotated[float, Gt(0)] = 1.1  # m/s/sqrt(s), without an IMU, on each axis
-    walk_time: Annotated[float, Gt(0)] = 2.0  # s, in which it comes back to 0
-    along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), with an IMU, along the heading
-    along_time: Annotated[float, Gt(0)] = 2.0  # s, in which it comes back to the usual speed
-    usual_speed: Annotated[float, Ge(0)] = 0.9  # m/s, of somebody who walks
-    across_noise: Annotated[float, Gt(0)] = 0.3  # m/s/sqrt(s), with an IMU, across it
-    across_speed: Annotated[float, Gt(0)] = 0.1  # m/s, sd of the speed across the heading
-    yaw_error: Annotated[float, Ge(0)] = math.radians(7.0)  # rad, sd of beta
-    yaw_time: Annotated[float, Gt(0)] = 20.0  # s, correlation of beta
-    speed_error: Annotated[float, Gt(0)] = 0.12  # m/s
-    speed_share: Annotated[float, Gt(0), Le(1)] = 0.6  # of an echo that is new: windows overlap
-    strength_error: Annotated[float, Gt(0)] = 4.0  # dB, fast fading
-    strength_share: Annotated[float, Gt(0), Le(1)] = 0.3
-    bias_error: Annotated[float, Ge(0)] = 1.5  # dB, sd of b
-    bias_time: Annotated[float, Gt(0)] = 5.0  # s, correlation of b
-    gamma: float = 0.0  # expected
-    gamma_error: Annotated[float, Ge(0)] = 0.0
-    reference_range: Annotated[float, Gt(0)] = 6.0  # m, where k is right whatever gamma
-    range_error: Annotated[float, Gt(0)] = 0.1  # m, of sensors that measure it
-    edge_error: Annotated[float, Gt(0)] = 1.0  # m, sd of how far beyond the area's edge somebody may be
-    degrees: Annotated[float, Gt(2)] = 4.0  # of freedom of the Student-t that all errors are taken to have
-    gate: Annotated[float, Gt(1)] = 5.0  # sd beyond which a measurement is discarded
-    way_noise: Annotated[float, Gt(0)] = 0.1  # m/sqrt(s), of dead reckoning
-    way_turn_noise: Annotated[float, Gt(0)] = math.radians(2.0)  # rad/sqrt(s), of its yaw: iron in a room, or drift
-    way_time: Annotated[float, Gt(0)] = 0.8  # s over which its velocity is averaged: a cane swings
-    way_speed_error: Annotated[float, Gt(0)] = 0.25  # m/s, sd of each component of that mean, in a bend above all
-    hold_after: Annotated[float, Gt(0)] = 0.7  # s with hardly a valid echo, after which the position is held
-    hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
-    hold_speed: Annotated[float, Ge(0)] = 0.3  # m/s, sd of each component of the velocity then
-    hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
-    set_off_speed: Annotated[float, Ge(0)] = 0.5  # m/s along the heading, with an IMU, of who begins to walk
-    set_off_error: Annotated[float, Gt(0)] = 0.4  # m/s, its sd
-    start_speed: Annotated[float, Gt(0)] = 0.7  # m/s, sd of each component before anything is known
-    heading_timeout: Annotated[float, Gt(0)] = 0.5  # s, after which the IMU counts as silent
+    walk_noise: Density = 1.1  # m/s/sqrt(s), without an IMU, on each axis
+    walk_time: Time = 2.0  # s, in which it comes back to 0
+    along_noise: Density = 0.6  # m/s/sqrt(s), with an IMU, along the heading
+    along_time: Time = 2.0  # s, in which it comes back to the usual speed
+    usual_speed: Speed | Zero = 0.9  # m/s, of somebody who walks
+    across_noise: Density = 0.3  # m/s/sqrt(s), with an IMU, across it
+    across_speed: Speed = 0.1  # m/s, sd of the speed across the heading
+    yaw_error: Angle | Zero = math.radians(7.0)  # rad, sd of beta
+    yaw_time: Time = 20.0  # s, correlation of beta
+    speed_error: Speed = 0.12  # m/s
+    speed_share: Fraction = 0.6  # of an echo that is new: windows overlap
+    strength_error: Decibels = 4.0  # dB, fast fading
+    strength_share: Fraction = 0.3
+    bias_error: Decibels | Zero = 1.5  # dB, sd of b
+    bias_time: Time = 5.0  # s, correlation of b
+    gamma: Annotated[float, Ge(-10), Le(10)] = 0.0  # expected
+    gamma_error: Fraction | Zero = 0.0
+    reference_range: Length = 6.0  # m, where k is right whatever gamma
+    range_error: Factor = 0.1  # m, of sensors that measure it
+    edge_error: Length = 1.0  # m, sd of how far beyond the area's edge somebody may be
+    degrees: DegreesOfFreedom = 4.0  # of freedom of the Student-t that all errors are taken to have
+    gate: Annotated[float, Gt(1), Le(1000)] = 5.0  # sd beyond which a measurement is discarded
+    way_noise: Density = 0.1  # m/sqrt(s), of dead reckoning
+    way_turn_noise: Density = math.radians(2.0)  # rad/sqrt(s), of its yaw: iron in a room, or drift
+    way_time: Time = 0.8  # s over which its velocity is averaged: a cane swings
+    way_speed_error: Speed = 0.25  # m/s, sd of each component of that mean, in a bend above all
+    hold_after: Time = 0.7  # s with hardly a valid echo, after which the position is held
+    hold_decay: Time = 0.3  # s, the velocity's then
+    hold_speed: Speed | Zero = 0.3  # m/s, sd of each component of the velocity then
+    hold_noise: Density = 0.3  # m/sqrt(s), of the position then
+    set_off_speed: Speed | Zero = 0.5  # m/s along the heading, with an IMU, of who begins to walk
+    set_off_error: Speed = 0.4  # m/s, its sd
+    start_speed: Speed = 0.7  # m/s, sd of each component before anything is known
+    heading_timeout: Time = 0.5  # s, after which the IMU counts as silent
 
 
 class RoomEkf:

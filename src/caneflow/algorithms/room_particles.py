@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from caneflow.algorithms.particle_filter import (
@@ -23,6 +23,7 @@ from caneflow.algorithms.particle_filter import (
     student_t,
     weighted_covariance,
 )
+from caneflow.algorithms.quantities import Angle, Decibels, Density, Factor, Fraction, Probability, Speed, Time, Zero
 from caneflow.algorithms.room_tracking import (
     DECIBEL,
     LEAST_COSINE,
@@ -47,28 +48,28 @@ class RoomParticleSettings:
     use_strength: bool = True
     use_heading: bool = True
     particles: ParticleSettings = field(default_factory=ParticleSettings)
-    walk_noise: Annotated[float, Gt(0)] = 0.5  # m/s/sqrt(s), on each axis: a bend and a change of pace
-    along_noise: Annotated[float, Gt(0)] = 0.6  # m/s/sqrt(s), of the speed along the heading
-    fastest: Annotated[float, Gt(0)] = 2.0  # m/s
-    start_speed: Annotated[float, Ge(0)] = 0.7  # m/s, sd of each component
-    speed_error: Annotated[float, Gt(0)] = 0.12  # m/s
-    speed_outliers: Annotated[float, Ge(0), Le(1)] = 0.1
-    speed_share: Annotated[float, Gt(0), Le(1)] = 0.5  # of an echo that is new: windows overlap
-    strength_error: Annotated[float, Gt(0)] = 5.0  # dB
-    strength_share: Annotated[float, Gt(0), Le(1)] = 0.2
-    degrees: Annotated[float, Gt(0)] = 4.0  # of freedom of the strength's Student-t
-    range_error: Annotated[float, Gt(0)] = 0.1  # m, of sensors that measure it
-    heading_error: Annotated[float, Gt(0)] = math.radians(7.0)  # rad
-    heading_share: Annotated[float, Gt(0), Le(1)] = 0.025  # its error lasts for seconds, an update for 50 ms
-    heading_time: Annotated[float, Gt(0)] = 20.0  # s, correlation of the yaw's error
-    turn_noise: Annotated[float, Gt(0)] = 1.0  # rad/sqrt(s), of a heading that nobody measures
-    edge_share: Annotated[float, Ge(0)] = 0.5  # 1/m^2: how fast it becomes unlikely to be outside of the area
-    consistent: Annotated[float, Gt(0)] = 3.0  # sd: a measurement farther from every particle is discarded
-    roughening: Annotated[float, Ge(0)] = 0.05  # m, after resampling
-    hold_after: Annotated[float, Gt(0)] = 0.7  # s with hardly a valid echo, after which the position is held
-    hold_decay: Annotated[float, Gt(0)] = 0.3  # s, the velocity's then
-    hold_noise: Annotated[float, Gt(0)] = 0.3  # m/sqrt(s), of the position then
-    heading_timeout: Annotated[float, Gt(0)] = 0.5  # s, after which the IMU counts as silent
+    walk_noise: Density = 0.5  # m/s/sqrt(s), on each axis: a bend and a change of pace
+    along_noise: Density = 0.6  # m/s/sqrt(s), of the speed along the heading
+    fastest: Speed = 2.0  # m/s
+    start_speed: Speed | Zero = 0.7  # m/s, sd of each component
+    speed_error: Speed = 0.12  # m/s
+    speed_outliers: Probability = 0.1
+    speed_share: Fraction = 0.5  # of an echo that is new: windows overlap
+    strength_error: Decibels = 5.0  # dB
+    strength_share: Fraction = 0.2
+    degrees: Annotated[float, Ge(0.1), Le(1000)] = 4.0  # of freedom of the strength's Student-t
+    range_error: Fraction = 0.1  # m, of sensors that measure it
+    heading_error: Angle = math.radians(7.0)  # rad
+    heading_share: Fraction = 0.025  # its error lasts for seconds, an update for 50 ms
+    heading_time: Time = 20.0  # s, correlation of the yaw's error
+    turn_noise: Density = 1.0  # rad/sqrt(s), of a heading that nobody measures
+    edge_share: Factor | Zero = 0.5  # 1/m^2: how fast it becomes unlikely to be outside of the area
+    consistent: Factor = 3.0  # sd: a measurement farther from every particle is discarded
+    roughening: Factor | Zero = 0.05  # m, after resampling
+    hold_after: Time = 0.7  # s with hardly a valid echo, after which the position is held
+    hold_decay: Time = 0.3  # s, the velocity's then
+    hold_noise: Density = 0.3  # m/sqrt(s), of the position then
+    heading_timeout: Time = 0.5  # s, after which the IMU counts as silent
 
 
 class _RoomParticles(ABC):

@@ -7,10 +7,8 @@ A standing hand drifts and trembles (some 0.1 m/s^2, a few deg/s); a walking one
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Annotated
 
-from annotated_types import Gt
-
+from caneflow.algorithms.quantities import Acceleration, Time, TurnRate
 from caneflow.algorithms.rotations import Vector
 
 
@@ -18,9 +16,9 @@ from caneflow.algorithms.rotations import Vector
 class StandingSettings:
     """What counts as standing still."""
 
-    window: Annotated[float, Gt(0)] = 0.6  # s
-    largest_turn_rate: Annotated[float, Gt(0)] = math.radians(5.0)  # rad/s, mean norm: bias, drift and tremor
-    largest_acceleration: Annotated[float, Gt(0)] = 0.12  # m/s^2, sd about its mean, on the worst axis
+    window: Time = 0.6  # s
+    largest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm: bias, drift and tremor
+    largest_acceleration: Acceleration = 0.12  # m/s^2, sd about its mean, on the worst axis
 
 
 class StandingDetector:

@@ -5,11 +5,9 @@ The cane is swung once per step. Between two swings it stands still for an insta
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
-
-from annotated_types import Gt
 
 from caneflow.algorithms.dead_reckoning import PoseEstimate, SampleClock, heading_of, required_orientation
+from caneflow.algorithms.quantities import Time, TurnRate
 from caneflow.algorithms.rotations import Quaternion, Vector
 
 
@@ -17,9 +15,9 @@ from caneflow.algorithms.rotations import Quaternion, Vector
 class StepHeadingSettings:
     """When the cane stands still, and what is a swing."""
 
-    stationary_rate: Annotated[float, Gt(0)] = math.radians(25.0)  # rad/s: a stationary point lies below
-    swing_rate: Annotated[float, Gt(0)] = math.radians(40.0)  # rad/s: the peak of a swing lies above
-    shortest_swing: Annotated[float, Gt(0)] = 0.45  # s between stationary points
+    stationary_rate: TurnRate = math.radians(25.0)  # rad/s: a stationary point lies below
+    swing_rate: TurnRate = math.radians(40.0)  # rad/s: the peak of a swing lies above
+    shortest_swing: Time = 0.45  # s between stationary points
 
     def __post_init__(self) -> None:
         if not self.swing_rate > self.stationary_rate:

@@ -9,11 +9,12 @@ it does to the track is the business of heading_hypotheses.py.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Final
 
 import numpy as np
-from annotated_types import Ge, Gt
 from numpy.typing import NDArray
+
+from caneflow.algorithms.quantities import Acceleration, Angle, Density, Factor, Speed, Zero
 
 Floats = NDArray[np.float64]
 
@@ -25,13 +26,13 @@ _IDENTITY: Final = np.eye(7)
 class WalkMotionSettings:
     """Noises of the filter."""
 
-    velocity: Annotated[float, Gt(0)] = 1.0  # m/s, sd at the start and after a gap
-    acceleration_noise: Annotated[float, Gt(0)] = 0.03  # m/s^2 / sqrt(Hz): a swing, sampled at 100 Hz
-    bias: Annotated[float, Gt(0)] = 0.1  # m/s^2, sd at the start: 0.07 of the chip, 0.045 of 0.26 deg of tilt
-    bias_walk: Annotated[float, Gt(0)] = 0.0225  # m/s^2 / sqrt(s): that tilt, correlated over 8 s
-    pointing: Annotated[float, Gt(0)] = 0.06  # rad, sd of beta at the start
-    pointing_walk: Annotated[float, Ge(0)] = 0.01  # rad / sqrt(s): a wander of 1.5 deg over some steps
-    outlier: Annotated[float, Gt(0)] = 3.0  # sd, from which on a measurement counts as that far off and no farther
+    velocity: Speed = 1.0  # m/s, sd at the start and after a gap
+    acceleration_noise: Density = 0.03  # m/s^2 / sqrt(Hz): a swing, sampled at 100 Hz
+    bias: Acceleration = 0.1  # m/s^2, sd at the start: 0.07 of the chip, 0.045 of 0.26 deg of tilt
+    bias_walk: Density = 0.0225  # m/s^2 / sqrt(s): that tilt, correlated over 8 s
+    pointing: Angle = 0.06  # rad, sd of beta at the start
+    pointing_walk: Density | Zero = 0.01  # rad / sqrt(s): a wander of 1.5 deg over some steps
+    outlier: Factor = 3.0  # sd, from which on a measurement counts as that far off and no farther
 
 
 class WalkMotion:

@@ -1,14 +1,21 @@
 """The rig: what is bolted on, as opposed to what flows. One map, for every node and in every recording."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
+from annotated_types import Ge, Le
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from caneflow.messages.errors import MessageError
-from caneflow.messages.samples import Vector3
 
-Area = tuple[float, float, float, float]
+# What bolts things together is measured with a ruler: a lever is no longer than a person, a building is no longer than
+# ten kilometres, and nobody reads less than a millimetre.
+Component: TypeAlias = Annotated[float, Ge(-10), Le(10)]  # of a direction: its norm is looked at after that
+Lever: TypeAlias = Annotated[float, Ge(-10), Le(10)]  # m
+Place: TypeAlias = Annotated[float, Ge(-1e4), Le(1e4)]  # m, R0
+Direction: TypeAlias = tuple[Component, Component, Component]
+Levers: TypeAlias = tuple[Lever, Lever, Lever]
+Area: TypeAlias = tuple[Place, Place, Place, Place]
 
 MOST_CAUSES = 20  # that are told of one rig
 
@@ -18,9 +25,10 @@ class Sensor(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    position: Annotated[Vector3, Field(description="m, R0")]
-    azimuth: Annotated[float, Field(description="rad, of the boresight, counter-clockwise from x0")]
-    k: Annotated[float | None, Field(gt=0, description="m^4: range = (k / amplitude^2)^(1/4)")] = None
+    position: Annotated[tuple[Place, Place, Place], Field(description="m, R0")]
+    azimuth: Annotated[float, Field(ge=-100, le=100, description="rad, of the boresight, counter-clockwise from x0")]
+    # 1 mm to 1 km where the amplitude is 1
+    k: Annotated[float | None, Field(ge=1e-12, le=1e12, description="m^4: range = (k / amplitude^2)^(1/4)")] = None
 
 
 class Start(BaseModel):
@@ -28,8 +36,8 @@ class Start(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    position: Annotated[tuple[float, float], Field(description="m, R0")]
-    sd: Annotated[float, Field(gt=0, description="m")]
+    position: Annotated[tuple[Place, Place], Field(description="m, R0")]
+    sd: Annotated[float, Field(ge=1e-3, le=1e4, description="m")]
 
 
 class Rig(BaseModel):
@@ -37,23 +45,23 @@ class Rig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    boresight: Annotated[Vector3, Field(description="unit vector of the radar's axis, body frame")] = (
+    boresight: Annotated[Direction, Field(description="unit vector of the radar's axis, body frame")] = (
         0.0,
         1.0,
         0.0,
     )
-    hand_height: Annotated[float | None, Field(gt=0, description="m, of the hand above ground")] = None
-    aperture: Annotated[float | None, Field(gt=0, lt=3.2, description="rad, full -3 dB angle (delta)")] = None
-    pivot: Annotated[Vector3 | None, Field(description="m, from the sensors to the hand, body frame")] = None
-    antenna: Annotated[Vector3, Field(description="m, from IMU to antenna, body frame")] = (0.0, 0.0, 0.0)
-    step_length: Annotated[float | None, Field(gt=0, description="m, step-and-heading only")] = None
+    hand_height: Annotated[float | None, Field(ge=0.01, le=10, description="m, of the hand above ground")] = None
+    aperture: Annotated[float | None, Field(ge=1e-3, lt=3.2, description="rad, full -3 dB angle (delta)")] = None
+    pivot: Annotated[Levers | None, Field(description="m, from the sensors to the hand, body frame")] = None
+    antenna: Annotated[Levers, Field(description="m, from IMU to antenna, body frame")] = (0.0, 0.0, 0.0)
+    step_length: Annotated[float | None, Field(ge=0.01, le=10, description="m, step-and-heading only")] = None
     sensors: Annotated[dict[str, Sensor], Field(description="room: Doppler modules by node name")] = {}
     area: Annotated[Area | None, Field(description="room: xmin, xmax, ymin, ymax, m")] = None
     start: Annotated[Start | None, Field(description="room: the user's guess of the start")] = None
 
     @field_validator("boresight")
     @classmethod
-    def _unit(cls, boresight: Vector3) -> Vector3:
+    def _unit(cls, boresight: Direction) -> Direction:
         norm = sum(x * x for x in boresight) ** 0.5
         if abs(norm - 1) > 1e-3:
             raise ValueError(f"has norm {norm:.6g}; a direction has 1")

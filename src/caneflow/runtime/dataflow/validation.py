@@ -195,6 +195,8 @@ def _takes(schema: JsonSchema) -> str:
         return f"one of {listed(map(str, schema.get('enum', [schema.get('const')])))}"
     kind = schema.get("type")
     if kind in ("integer", "number"):
+        if "minimum" in schema and schema["minimum"] == schema.get("maximum"):
+            return _number(schema["minimum"])
         return ("a whole number" if kind == "integer" else "a number") + _bounds(schema)
     if kind == "string":
         examples = schema.get("examples")

@@ -53,10 +53,10 @@ class InputShape(Shape):
     ] = "all"
     max_lag_ms: Annotated[
         float | None,
-        Field(ge=0, description="ms, live: how long the node waits for this input; left out: for ever"),
+        Field(ge=0, le=3.6e6, description="ms, live: how long the node waits for this input; left out: for ever"),
     ] = None
     max_age_ms: Annotated[
-        float | None, Field(gt=0, description="ms, live: an older sample is dropped; left out: none is")
+        float | None, Field(ge=0.1, le=3.6e6, description="ms, live: an older sample is dropped; left out: none is")
     ] = None
 
 
@@ -72,12 +72,12 @@ class RestartShape(Shape):
     ] = 10
     window_s: Annotated[
         float,
-        Field(gt=0, le=86400, description="s that the node has to be up until earlier ends of it no longer count"),
+        Field(ge=0.1, le=86400, description="s that the node has to be up until earlier ends of it no longer count"),
     ] = 60.0
     delay_s: Annotated[
         float, Field(ge=0, le=3600, description="s before the first restart; doubles with each one that counts")
     ] = 0.25
-    max_delay_s: Annotated[float, Field(gt=0, le=3600, description="s; the delay grows no further")] = 10.0
+    max_delay_s: Annotated[float, Field(ge=1e-3, le=3600, description="s; the delay grows no further")] = 10.0
 
 
 class MachineShape(Shape):
@@ -152,7 +152,7 @@ class NodeShape(Shape):
         Field(description="external only: for each port, the message it sends, e.g. `Imu` or `caneflow.Imu/1`"),
     ] = {}
     ready_timeout_s: Annotated[
-        float, Field(gt=0, le=3600, description="s from its start within which the node says that it is ready")
+        float, Field(ge=0.1, le=3600, description="s from its start within which the node says that it is ready")
     ] = 20.0
 
 
