@@ -12,11 +12,11 @@ import msgspec
 from annotated_types import Ge, Le
 
 from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.dead_reckoning import GRAVITY
 from caneflow.algorithms.initial_attitude import NORTH_YAW, AttitudeMethod
 from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, from_yaw, multiply, normalized, rotate
 from caneflow.messages import Imu, Sample
+from caneflow.physics import GRAVITY
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caneflow.algorithms.analytic_signal import AnalyticSignal, fast_time_frequencies
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
+from caneflow.physics import SPEED_OF_LIGHT
 
 STEP = 0.009149  # m
 CARRIER, BANDWIDTH = 4.3e9, 1.7e9  # Hz

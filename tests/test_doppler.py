@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.io import wavfile
 
 from caneflow.algorithms.doppler_line import (
-    SPEED_OF_LIGHT,
     DopplerLine,
     DopplerLineSettings,
     predominant_line,
@@ -24,6 +23,7 @@ from caneflow.algorithms.doppler_spectrum import (
     NoiseFloor,
     SlidingSpectrum,
 )
+from caneflow.physics import SPEED_OF_LIGHT
 
 CW24 = Path(__file__).parents[1].parent / "shared" / "data" / "cw24-walk"
 RATE = 4000.0  # Hz

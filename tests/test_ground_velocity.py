@@ -16,8 +16,8 @@ from caneflow.algorithms.ground_velocity import (
     beam_factor,
 )
 from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 from caneflow.algorithms.rotations import Quaternion, from_rotation_vector
+from caneflow.physics import SPEED_OF_LIGHT
 
 Scans = NDArray[np.complex64]
 PARAMETERS = RadarParameters(scan_period=0.01, range_start=0.3, range_step=0.00915, carrier=4.3e9, bandwidth=1.7e9)

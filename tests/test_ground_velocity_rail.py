@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
 from caneflow.algorithms.pulse_pairs import PulsePairWindow, line_phase
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
+from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.protocols.mrm_scans import Scan, parse_log
 
 Floats = NDArray[np.float64]

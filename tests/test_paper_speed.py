@@ -17,9 +17,9 @@ from caneflow.algorithms.moving_returns import (
     RadarParameters,
 )
 from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 from caneflow.algorithms.rest import RestSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, from_rotation_vector
+from caneflow.physics import SPEED_OF_LIGHT
 
 PARAMETERS = RadarParameters(scan_period=0.01, range_start=0.3, range_step=0.009149, carrier=4.3e9, bandwidth=1.7e9)
 PERIOD = 10_000_000  # ns

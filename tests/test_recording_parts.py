@@ -19,10 +19,10 @@ from caneflow.messages import Imu, numbered
 from caneflow.messages.rig import read_rig
 from caneflow.recording import Recording, RecordingError, RecordingWriter
 from caneflow.recording.layout import Block, Content, Declarations, content_of
-from caneflow.recording.parts import LastSeconds, RotatingWriter, Rotation, part_path, read_span
+from caneflow.recording.parts import WRITE_NOW, LastSeconds, RotatingWriter, Rotation, part_path, read_span
 from caneflow.recording.reader import GLANCE_BLOCKS
 from caneflow.runtime import Context
-from tools.record import WRITE_NOW, Recorder, RecordSettings
+from tools.record import Recorder, RecordSettings
 
 STEP = 10_000_000  # ns: 100 Hz
 KEY = "cane/imu/imu"

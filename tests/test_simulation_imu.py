@@ -12,8 +12,8 @@ from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.imu import (
     ACCEL_STEP,
     EARTH_FIELD,
-    GRAVITY,
     GYRO_STEP,
+    LOCAL_GRAVITY,
     MAG_STEP,
     QUATERNION_STEP,
     ImuSamples,
@@ -69,7 +69,7 @@ def test_outputs_are_on_the_chips_grids(walked: tuple[Motion, ImuSamples]) -> No
 
 def test_a_chip_at_rest_feels_gravity_upwards() -> None:
     imu = measure(standing(1.0), IDEAL, default_rng(0))
-    expected = [0.0, -GRAVITY * np.sin(42.0 * DEGREE), GRAVITY * np.cos(42.0 * DEGREE)]
+    expected = [0.0, -LOCAL_GRAVITY * np.sin(42.0 * DEGREE), LOCAL_GRAVITY * np.cos(42.0 * DEGREE)]
     assert imu.accel[50] == pytest.approx(expected, abs=ACCEL_STEP)
     assert imu.linear_accel[50] == pytest.approx([0.0, 0.0, 0.0], abs=ACCEL_STEP)
     assert np.abs(imu.gyro).max() == 0.0
@@ -78,7 +78,7 @@ def test_a_chip_at_rest_feels_gravity_upwards() -> None:
 
 def test_linear_acceleration_and_gravity_are_the_acceleration(walked: tuple[Motion, ImuSamples]) -> None:
     _, imu = walked
-    up = attitude.rotate(attitude.conjugate(imu.orientation), np.array([0.0, 0.0, GRAVITY]))
+    up = attitude.rotate(attitude.conjugate(imu.orientation), np.array([0.0, 0.0, LOCAL_GRAVITY]))
     # two roundings of a half step, and the rounding of the quaternion
     assert np.abs(imu.linear_accel + up - imu.accel).max() < ACCEL_STEP + 20.0 * QUATERNION_STEP
 
@@ -103,10 +103,10 @@ def test_gyro_integrates_to_the_orientation() -> None:
 
 
 def test_gyro_and_accelerometer_noise_are_the_data_sheets() -> None:
-    noisy = replace(IDEAL, gyro_noise=0.014 * DEGREE, accel_noise=190e-6 * GRAVITY)
+    noisy = replace(IDEAL, gyro_noise=0.014 * DEGREE, accel_noise=190e-6 * LOCAL_GRAVITY)
     imu = measure(standing(60.0), noisy, default_rng(1))
     gyro = np.hypot(0.014 * DEGREE * np.sqrt(50.0), GYRO_STEP / np.sqrt(12.0))
-    accel = np.hypot(190e-6 * GRAVITY * np.sqrt(50.0), ACCEL_STEP / np.sqrt(12.0))
+    accel = np.hypot(190e-6 * LOCAL_GRAVITY * np.sqrt(50.0), ACCEL_STEP / np.sqrt(12.0))
     assert imu.gyro.std(axis=0) == pytest.approx(gyro, rel=0.05)
     assert imu.accel.std(axis=0) == pytest.approx(accel, rel=0.05)
 

@@ -7,11 +7,11 @@ import pytest
 from numpy.random import default_rng
 from scipy.signal import hilbert
 
+from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.course import course
 from caneflow.simulation.radar import (
-    LIGHT,
     RANGE_STEP,
     RadarSettings,
     echoes,
@@ -52,7 +52,7 @@ def test_an_approaching_scatterer_has_positive_doppler_of_the_right_size() -> No
     at_bin = analytic[:, np.argmin(np.abs(SETTINGS.ranges() - 1.5))]
     step = np.angle(np.sum(at_bin[1:] * np.conj(at_bin[:-1])))
     doppler = step / (2.0 * np.pi * period)
-    assert doppler == pytest.approx(2.0 * speed * SETTINGS.carrier / LIGHT, rel=1e-3)
+    assert doppler == pytest.approx(2.0 * speed * SETTINGS.carrier / SPEED_OF_LIGHT, rel=1e-3)
 
 
 def test_power_falls_as_the_fourth_power_of_range() -> None:
@@ -79,7 +79,7 @@ def test_the_pulse_has_1_7_ghz_between_its_10_db_points() -> None:
     antenna, boresight = at_origin(1)
     echo = echoes(antenna, boresight, np.array([[1.5, 0, 0]]), np.ones(1, complex), RIG.aperture, SETTINGS)
     spectrum = np.abs(np.fft.rfft(echo.real[0], 1 << 14)) ** 2
-    frequency = np.fft.rfftfreq(1 << 14, 2.0 * RANGE_STEP / LIGHT)
+    frequency = np.fft.rfftfreq(1 << 14, 2.0 * RANGE_STEP / SPEED_OF_LIGHT)
     wide = frequency[spectrum > 0.1 * spectrum.max()]
     assert frequency[spectrum.argmax()] == pytest.approx(4.3e9, rel=2e-3)
     assert wide[-1] - wide[0] == pytest.approx(1.7e9, rel=2e-2)
@@ -93,7 +93,7 @@ def test_echoes_agree_with_the_slow_sum_over_pulses() -> None:
     points = np.column_stack([rng.uniform(0.2, 2.0, 40), rng.uniform(-1.0, 1.0, 40), np.zeros(40)])
     amplitudes = rng.normal(size=40) + 1j * rng.normal(size=40)
     slow = np.zeros((2, SETTINGS.bins), dtype=complex)
-    k = 4.0 * np.pi * SETTINGS.carrier / LIGHT
+    k = 4.0 * np.pi * SETTINGS.carrier / SPEED_OF_LIGHT
     for i in range(2):
         for point, amplitude in zip(points, amplitudes, strict=True):
             d = point - antenna[i]

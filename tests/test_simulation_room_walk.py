@@ -17,7 +17,7 @@ from caneflow.simulation.belt_imu import (
     measure,
     room_field,
 )
-from caneflow.simulation.imu import GRAVITY
+from caneflow.simulation.imu import LOCAL_GRAVITY
 from caneflow.simulation.room_course import (
     RATE,
     CourseSettings,
@@ -178,7 +178,7 @@ def test_the_gyro_integrates_to_the_heading() -> None:
 def test_a_belt_at_rest_feels_gravity_and_north() -> None:
     way = standing(np.array([2.0, 3.0]), 0.0, 5.0)
     imu = worn(way)
-    assert imu.accel == pytest.approx(np.tile([0.0, 0.0, GRAVITY], (500, 1)), abs=ACCEL_STEP)
+    assert imu.accel == pytest.approx(np.tile([0.0, 0.0, LOCAL_GRAVITY], (500, 1)), abs=ACCEL_STEP)
     assert not imu.gyro.any()
     # facing east (x0), north (y0) is to the left (y of the body), and the field points down
     assert imu.mag[0] == pytest.approx([0.0, 22.5, -41.5], abs=0.1)
@@ -188,12 +188,12 @@ def test_a_belt_at_rest_feels_gravity_and_north() -> None:
 
 def test_noise_is_the_data_sheets() -> None:
     way = standing(np.array([2.0, 3.0]), 0.0, 60.0)
-    noisy = replace(IDEAL, gyro_noise=0.01 * DEGREE, accel_noise=300e-6 * GRAVITY, mag_noise=0.5)
+    noisy = replace(IDEAL, gyro_noise=0.01 * DEGREE, accel_noise=300e-6 * LOCAL_GRAVITY, mag_noise=0.5)
     imu = worn(way, noisy)
     assert imu.gyro.std(axis=0) == pytest.approx(
         np.hypot(0.01 * DEGREE * np.sqrt(50.0), GYRO_STEP / np.sqrt(12.0)), rel=0.05
     )
-    assert imu.accel.std(axis=0) == pytest.approx(300e-6 * GRAVITY * np.sqrt(50.0), rel=0.05)
+    assert imu.accel.std(axis=0) == pytest.approx(300e-6 * LOCAL_GRAVITY * np.sqrt(50.0), rel=0.05)
     assert imu.mag.std(axis=0) == pytest.approx(0.5, rel=0.05)
 
 

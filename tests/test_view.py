@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered, sample_key
 from caneflow.messages.rig import Rig
+from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.recording import RecordingWriter
 from caneflow.viewing import live
 from caneflow.viewing.columns import COLUMNS, ellipse, row_of

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.dead_reckoning import GRAVITY, heading_of
+from caneflow.algorithms.dead_reckoning import heading_of
 from caneflow.algorithms.doppler_line import DopplerLineSettings, predominant_line
 from caneflow.algorithms.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
 from caneflow.algorithms.room_calibration import CalibrationSettings, counting, hops_over, range_calibration, sight
@@ -29,6 +29,7 @@ from caneflow.errors import CaneflowError
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
+from caneflow.physics import GRAVITY
 from caneflow.runtime.replays.workers import mapped
 from caneflow.simulation.doppler_module import Kind
 from caneflow.simulation.room_scenario import PARTS, Part, RoomRecording, World, room_settings, simulate_kinds

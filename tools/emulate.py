@@ -33,12 +33,12 @@ from caneflow.protocols.mrm_scans import (
     split_scan,
 )
 from caneflow.recording import Recording
+from caneflow.simulation.imu import LOCAL_GRAVITY
 
 MCAP = b"\x89MCAP"  # how a recording begins; a log begins with a configuration block
 LONGEST_WAIT = 0.5  # s
 SERIAL_PORT = Path(gettempdir()) / "caneflow-bno055"
 TERMINALS = Path("/dev/pts")
-GRAVITY = 9.81  # m/s^2
 
 
 # --- options of both --------------------------------------------------------------------------------------------
@@ -230,8 +230,8 @@ def _registers(path: Path, sample: Sample) -> bytes:
         raise CaneflowError(f"{path}: the IMU gave no orientation or no linear acceleration, which a BNO055 does")
     w, x, y, z = sample.orientation
     ax, ay, az = sample.linear_accel
-    gx, gy = 2 * GRAVITY * (x * z - w * y), 2 * GRAVITY * (y * z + w * x)
-    gz = GRAVITY * (1 - 2 * (x * x + y * y))
+    gx, gy = 2 * LOCAL_GRAVITY * (x * z - w * y), 2 * LOCAL_GRAVITY * (y * z + w * x)
+    gz = LOCAL_GRAVITY * (1 - 2 * (x * x + y * y))
     return registers(
         Measurement(
             gyro=sample.gyro,

@@ -11,13 +11,18 @@ import msgspec
 from annotated_types import Ge, Le
 
 from caneflow.messages import Pose, Sample, sample_key
-from caneflow.recording import Recorded, Recording, RecordingError, RecordingWriter
-from caneflow.recording.parts import LastSeconds, RotatingWriter, Rotation, further_part, parts_of, require_room
+from caneflow.recording import TRUTH, Recorded, Recording, RecordingError, RecordingWriter
+from caneflow.recording.parts import (
+    WRITE_NOW,
+    LastSeconds,
+    RotatingWriter,
+    Rotation,
+    further_part,
+    parts_of,
+    require_room,
+)
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.node import run
-
-TRUTH = ("truth", "pose")
-WRITE_NOW = b"write now"  # the one question that it answers
 
 log = logging.getLogger(__name__)
 

@@ -9,9 +9,8 @@ import typer
 from caneflow.errors import CaneflowError
 from caneflow.options import At, Keys
 from caneflow.printable import printable
+from caneflow.recording.parts import WRITE_NOW
 from caneflow.runtime.hosts.attach import DEFAULT_KEYS, attached
-
-WRITE_NOW = b"write now"  # what the recorder understands
 
 
 def command(

@@ -9,7 +9,7 @@ so positive Doppler means approaching.
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
+from caneflow.physics import SPEED_OF_LIGHT
 
 
 def fast_time_frequencies(bins: int, range_step: float) -> NDArray[np.float64]:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caneflow.algorithms.rotations import Quaternion, Vector, rotate
+from caneflow.physics import GRAVITY
 
-GRAVITY = 9.80665  # m/s^2
 LONGEST_INTERVAL = 0.5  # s between two IMU samples; a longer one is a gap (cane.md row 11)
 HISTORY = 512  # IMU samples that a late speed may reach back: 5 s at 100 Hz
 

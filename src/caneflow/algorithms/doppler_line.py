@@ -11,8 +11,8 @@ import numpy as np
 
 from caneflow.algorithms.doppler_spectrum import DopplerSpectrum
 from caneflow.algorithms.quantities import Decibels, Frequency, Probability, Zero
+from caneflow.physics import SPEED_OF_LIGHT
 
-SPEED_OF_LIGHT = 299_792_458.0  # m/s
 LOWEST_SNR = -99.0  # dB, of a spectrum with nothing in it
 
 

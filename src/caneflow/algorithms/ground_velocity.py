@@ -18,7 +18,7 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
-from caneflow.algorithms.dead_reckoning import GRAVITY, LONGEST_INTERVAL
+from caneflow.algorithms.dead_reckoning import LONGEST_INTERVAL
 from caneflow.algorithms.footprint import CaneGeometry, antenna_height, pitch
 from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
 from caneflow.algorithms.moving_returns import MovingReturns
@@ -35,8 +35,8 @@ from caneflow.algorithms.quantities import (
     TurnRate,
     Zero,
 )
-from caneflow.algorithms.range_doppler import SPEED_OF_LIGHT
 from caneflow.algorithms.rotations import Quaternion, Vector, rotate
+from caneflow.physics import GRAVITY, SPEED_OF_LIGHT
 
 Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]

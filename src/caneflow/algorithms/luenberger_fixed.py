@@ -15,9 +15,10 @@ from binascii import crc32
 from collections import deque
 from typing import Final, NamedTuple, TypeAlias
 
-from caneflow.algorithms.dead_reckoning import GRAVITY, PoseEstimate, required_orientation
+from caneflow.algorithms.dead_reckoning import PoseEstimate, required_orientation
 from caneflow.algorithms.luenberger import LuenbergerSettings
 from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.physics import GRAVITY
 
 METHOD: Final = "luenberger_fixed"
 

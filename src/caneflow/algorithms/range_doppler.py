@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-SPEED_OF_LIGHT = 299_792_458.0  # m/s
+from caneflow.physics import SPEED_OF_LIGHT
 
 
 def range_of_bin(

@@ -21,9 +21,10 @@ import numpy as np
 from annotated_types import Gt
 from numpy.typing import NDArray
 
-from caneflow.algorithms.dead_reckoning import GRAVITY, LONGEST_INTERVAL, PoseEstimate, SampleClock
+from caneflow.algorithms.dead_reckoning import LONGEST_INTERVAL, PoseEstimate, SampleClock
 from caneflow.algorithms.initial_attitude import level
 from caneflow.algorithms.rotations import Quaternion, Vector, from_rotation_vector, multiply, normalized, rotate
+from caneflow.physics import GRAVITY
 
 Matrix: TypeAlias = NDArray[np.float64]
 

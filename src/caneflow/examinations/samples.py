@@ -13,6 +13,7 @@ import numpy as np
 from caneflow.errors import CaneflowError
 from caneflow.messages import DopplerBlock, Imu, RadarFrame, Sample
 from caneflow.messages.rig import read_rig
+from caneflow.physics import GRAVITY
 from caneflow.runtime import Context, Quiet, Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.hosts.diagnosis import Finding
@@ -129,8 +130,10 @@ def _raw_imu(node: Node, samples: list[Imu]) -> Iterator[Finding]:
     if len(accel):
         pull = float(np.linalg.norm(accel.mean(axis=0)))
         text += f", feels {pull:.2f} m/s^2"
-        if rests and abs(pull - 9.81) > GRAVITY_TOLERANCE:
-            attempts.append("at rest it must feel 9.81 m/s^2: is accel_range the chip's? a board may be broken")
+        if rests and abs(pull - GRAVITY) > GRAVITY_TOLERANCE:
+            attempts.append(
+                f"at rest it must feel {GRAVITY:.2f} m/s^2: is accel_range the chip's? a board may be broken"
+            )
     if rests and turn > MOST_BIAS:
         attempts.append("at rest it turns: let it warm up; operators.attitude takes off what stays the same")
     if len(mag):
@@ -157,7 +160,7 @@ def _gravity_apart(sample: Imu) -> float | None:
     w, x, y, z = sample.orientation
     by_orientation = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
     by_accel = (a - b for a, b in zip(sample.accel, sample.linear_accel, strict=True))
-    return math.dist([9.81 * along for along in by_orientation], list(by_accel))
+    return math.dist([GRAVITY * along for along in by_orientation], list(by_accel))
 
 
 def _sound(node: Node, blocks: list[DopplerBlock]) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from typing import NamedTuple, TypeAlias
 
+from caneflow.physics import GRAVITY
 from caneflow.protocols.errors import ProtocolError
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -20,7 +21,7 @@ Vector: TypeAlias = tuple[float, float, float]
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0},
     "gyro": {"rad/s": 1.0, "deg/s": math.radians(1.0), "mdeg/s": math.radians(1e-3)},
-    "accel": {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3},
+    "accel": {"m/s^2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY},
     "mag": {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "mG": 0.1, "G": 100.0},
 }
 DEFAULT_UNITS = {quantity: next(iter(units)) for quantity, units in UNITS.items()}

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
+from caneflow.physics import GRAVITY
 from caneflow.protocols.errors import ProtocolError
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -77,7 +78,6 @@ GYRO_RANGES = {250: 0, 500: 1, 1000: 2, 2000: 3}  # deg/s
 ACCEL_RANGES = {2: 0, 4: 1, 8: 2, 16: 3}  # g
 # Bandwidth (Hz) of the filter -> its setting, and the delay of the gyro, s (RM 4.4). The accelerometer's are alike.
 FILTERS = {184: (1, 2.9e-3), 92: (2, 3.9e-3), 41: (3, 5.9e-3), 20: (4, 9.9e-3), 10: (5, 17.85e-3), 5: (6, 33.48e-3)}
-GRAVITY = 9.80665  # m/s^2 of a g
 MAG_STEP = 0.15  # uT, 16 bits (AK 5.3.4)
 TEMPERATURE_STEP, TEMPERATURE_ZERO = 1.0 / 333.87, 21.0  # degC, and at 0 (PS 3.4.2)
 

@@ -8,10 +8,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.mrm import SAMPLES_PER_PACKET, SCAN_INFO_BYTES, RadarConfig, ScanInfo, parse
 
-SPEED_OF_LIGHT = 299_792_458.0  # m/s
 BIN_SECONDS = 1e-9 / (512 * 1.024)  # s, the radar's finest step of delay
 ANTENNA_DELAY_PS = 10_000  # ps, path from the module to the stock antennas and back
 LOG_HEAD_BYTES = 32

@@ -18,6 +18,7 @@ from caneflow.recording.writer import RecordingWriter
 SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}  # bytes
 SPANS = {"s": 1, "min": 60, "h": 3600}  # s
 LEAST_ROOM = 512 * 1024  # bytes on a disk that has been full, before a recorder begins another part there
+WRITE_NOW = b"write now"  # what a recorder is asked that keeps the last seconds in memory
 LARGEST_BUFFER = 512 * 2**20  # bytes of samples that are kept in memory: a gateway has more to do
 
 # Path and number of a part -> its writer; raises FileExistsError where another run was faster.

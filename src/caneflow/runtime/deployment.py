@@ -15,7 +15,7 @@ import caneflow
 from caneflow.messages import MessageError, Sample, control_key, decode, sample_key
 from caneflow.messages.control import LeftOut
 from caneflow.messages.rig import overlaid, read_rig
-from caneflow.recording import Recording
+from caneflow.recording import TRUTH, Recording
 from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links import Ports, Sockets
@@ -26,7 +26,6 @@ from caneflow.runtime.wording import did_you_mean, listed
 LeftOutStamps: TypeAlias = dict[tuple[str, str], set[int]]
 
 RECORDER = "recorder"
-TRUTH = ("truth", "pose")
 REPLAYER_MODULE = "caneflow.drivers.replay"
 RECORDER_MODULE = "caneflow.tools.record"
 

@@ -13,7 +13,7 @@ from numpy.random import Generator
 
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
-from caneflow.simulation.imu import GRAVITY, SAMPLE_RATE, ImuSettings, magnetic_field
+from caneflow.simulation.imu import LOCAL_GRAVITY, SAMPLE_RATE, ImuSettings, magnetic_field
 from caneflow.simulation.room_course import RATE
 from caneflow.simulation.room_walk import Gait
 
@@ -29,7 +29,7 @@ class BeltImuSettings:
     gyro_bias: NotNegative = 0.5 * DEGREE  # rad/s, sd per axis
     gyro_start: NotNegative = 0.1 * DEGREE  # rad/s, sd per axis and recording (chosen)
     gyro_scale: NotNegative = 0.01  # sd per axis (data sheet: +-3 %)
-    accel_noise: NotNegative = 300e-6 * GRAVITY  # m/s^2/sqrt(Hz) (data sheet table 2)
+    accel_noise: NotNegative = 300e-6 * LOCAL_GRAVITY  # m/s^2/sqrt(Hz) (data sheet table 2)
     accel_bias: NotNegative = 0.15  # m/s^2, sd per axis (data sheet: +-60 mg, +-80 mg for z)
     mag_noise: NotNegative = 0.5  # uT, sd per axis (chosen: what an AK8963 shows at 100 Hz)
     hard_iron: NotNegative = 2.0  # uT, sd per axis: what a calibration before use leaves, plus a buckle (chosen)
@@ -60,9 +60,9 @@ class BeltSamples(NamedTuple):
 
 
 GYRO_STEP = DEGREE / 65.5  # rad/s, range of 500 deg/s (data sheet table 1)
-ACCEL_STEP = GRAVITY / 8192.0  # m/s^2, range of 4 g (data sheet table 2)
+ACCEL_STEP = LOCAL_GRAVITY / 8192.0  # m/s^2, range of 4 g (data sheet table 2)
 MAG_STEP = 0.15  # uT, AK8963 with 16 bit (data sheet)
-_GYRO_RANGE, _ACCEL_RANGE = 500.0 * DEGREE, 4.0 * GRAVITY
+_GYRO_RANGE, _ACCEL_RANGE = 500.0 * DEGREE, 4.0 * LOCAL_GRAVITY
 _EVERY = RATE // SAMPLE_RATE
 
 
@@ -89,7 +89,7 @@ def measure(walk: Gait, worn: Belt, settings: BeltImuSettings, rng: Generator, f
     acceleration = np.zeros_like(walk.centre)
     acceleration[1:-1] = RATE**2 * np.diff(walk.centre, 2, axis=0)
     to_body = attitude.conjugate(orientation)
-    force = attitude.rotate(to_body, acceleration + np.array([0.0, 0.0, GRAVITY]))
+    force = attitude.rotate(to_body, acceleration + np.array([0.0, 0.0, LOCAL_GRAVITY]))
     field = attitude.rotate(to_body[::_EVERY], room_field(walk.centre[::_EVERY], settings, field_rng))
 
     rate, force = rate[::_EVERY], force[::_EVERY]

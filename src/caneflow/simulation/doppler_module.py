@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import spline_filter1d
 from scipy.signal import butter, sosfilt
 
+from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.simulation.attitude import DEGREE, Floats
-from caneflow.simulation.radar import LIGHT
 from caneflow.simulation.room_course import RATE
 
 Kind: TypeAlias = Literal["real", "iq"]
@@ -63,7 +63,7 @@ class ModuleSettings:
     @property
     def wavelength(self) -> float:
         """Wavelength in m."""
-        return LIGHT / self.carrier
+        return SPEED_OF_LIGHT / self.carrier
 
 
 class Module(NamedTuple):

@@ -17,7 +17,7 @@ from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.walk import RATE, Motion
 
-GRAVITY = 9.81  # m/s^2, as wire.md has it at rest
+LOCAL_GRAVITY = 9.81  # m/s^2, of the place that is simulated, as wire.md has it; estimators assume physics.GRAVITY
 
 NotNegative = Annotated[float, Ge(0)]
 
@@ -29,7 +29,7 @@ class ImuSettings:
     gyro_noise: NotNegative = 0.014 * DEGREE  # rad/s/sqrt(Hz) (cane.md; data sheet table 0-2)
     gyro_bias: NotNegative = 0.05 * DEGREE  # rad/s, sd per axis (cane.md)
     gyro_scale: NotNegative = 0.007  # sd per axis (cane.md)
-    accel_noise: NotNegative = 190e-6 * GRAVITY  # m/s^2/sqrt(Hz) (cane.md; data sheet table 0-2)
+    accel_noise: NotNegative = 190e-6 * LOCAL_GRAVITY  # m/s^2/sqrt(Hz) (cane.md; data sheet table 0-2)
     accel_bias: NotNegative = 0.07  # m/s^2, sd per axis (cane.md)
     mag_noise: NotNegative = 0.3  # uT, sd per axis: the data sheet's resolution of the magnetometer
     tilt_error: NotNegative = 0.26 * DEGREE  # rad, sd about each horizontal axis (cane.md)
@@ -57,7 +57,7 @@ GYRO_STEP = DEGREE / 16.0  # rad/s, default units (data sheet table 3-22)
 ACCEL_STEP = 0.01  # m/s^2 (data sheet p. 30)
 MAG_STEP = 1.0 / 16.0  # uT (data sheet p. 30)
 QUATERNION_STEP = 2.0**-14  # (data sheet p. 36)
-_ACCEL_RANGE = 4.0 * GRAVITY  # m/s^2, fusion modes (data sheet table 3-4)
+_ACCEL_RANGE = 4.0 * LOCAL_GRAVITY  # m/s^2, fusion modes (data sheet table 3-4)
 _GYRO_BAND, _ACCEL_BAND = 32.0, 62.5  # Hz, -3 dB, fusion modes (data sheet table 3-4)
 _MAG_EVERY = 5  # samples: 20 Hz in NDOF (data sheet table 3-14)
 
@@ -77,7 +77,9 @@ def measure(motion: Motion, settings: ImuSettings, rng: Generator) -> ImuSamples
     count = len(orientation)
     rate = _low_passed(motion.rate, _GYRO_BAND)[::_EVERY]
     gyro = _gyro(rate, settings, gyro_rng)
-    force = attitude.rotate(attitude.conjugate(motion.orientation), motion.acceleration + np.array([0.0, 0.0, GRAVITY]))
+    force = attitude.rotate(
+        attitude.conjugate(motion.orientation), motion.acceleration + np.array([0.0, 0.0, LOCAL_GRAVITY])
+    )
     accel = _accel(_low_passed(force, _ACCEL_BAND)[::_EVERY], settings, accel_rng)
     field = magnetic_field(position, settings, field_rng)
     to_body = attitude.conjugate(orientation)
@@ -86,7 +88,7 @@ def measure(motion: Motion, settings: ImuSettings, rng: Generator) -> ImuSamples
 
     turning_error = attitude.rotate(orientation, gyro - rate)[:, 2]
     chip = _fusion(orientation, field, turning_error, settings, fusion_rng)
-    gravity = attitude.rotate(attitude.conjugate(chip), np.array([0.0, 0.0, GRAVITY]))
+    gravity = attitude.rotate(attitude.conjugate(chip), np.array([0.0, 0.0, LOCAL_GRAVITY]))
     return ImuSamples(
         gyro=_stepped(gyro, GYRO_STEP),
         accel=_stepped(np.clip(accel, -_ACCEL_RANGE, _ACCEL_RANGE), ACCEL_STEP),

@@ -16,14 +16,14 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
+from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import Floats
 from caneflow.simulation.scene import Complexes, Scene
 from caneflow.simulation.walk import Motion, Rig
 
 BORESIGHT = (0.0, 1.0, 0.0)  # of the radar in the body frame, as in the paper
-LIGHT = 299_792_458.0  # m/s
-RANGE_STEP = 0.5 * LIGHT * 32.0 / 512e9 / 1.024  # m, 61.035 ps: 32 bins of 1 / (512 x 1.024) ns (MRM protocol)
+RANGE_STEP = 0.5 * SPEED_OF_LIGHT * 32.0 / 512e9 / 1.024  # m, 61.035 ps: 32 bins of 1 / (512 x 1.024) ns (MRM protocol)
 
 _BLOCK = 16  # scans at a time: the arrays stay in the cache
 _FINER = 2  # cells per range bin on which echoes are added up; linear between cells costs -57 dB
@@ -219,7 +219,7 @@ def _spread(per_cell: Floats, exponent: int, settings: RadarSettings) -> Floats:
 def pulse_length(settings: RadarSettings) -> float:
     """Standard deviation (m of range) of the envelope: its power spectrum is down by 10 dB at +-bandwidth / 2."""
     in_frequency = 0.5 * settings.bandwidth / np.sqrt(np.log(10.0))  # Hz, of the amplitude spectrum
-    return float(0.5 * LIGHT / (2.0 * np.pi * in_frequency))
+    return float(0.5 * SPEED_OF_LIGHT / (2.0 * np.pi * in_frequency))
 
 
 def _cells(settings: RadarSettings) -> Floats:
@@ -237,4 +237,4 @@ def _beyond(settings: RadarSettings) -> int:
 
 def _wave_number(settings: RadarSettings) -> float:
     """Phase per metre of range, there and back, rad/m."""
-    return 4.0 * np.pi * settings.carrier / LIGHT
+    return 4.0 * np.pi * settings.carrier / SPEED_OF_LIGHT
