@@ -1,29 +1,53 @@
 /* Imu, GroundSpeed and Pose of the wire, version 1; see messages.h.
  *
- * What is read is checked: types, lengths, finite numbers, nothing behind the end. What is not read is skipped. */
+ * What is read is checked: types, lengths, numbers within their bounds, nothing behind the end. What is not read is
+ * skipped. */
 #include "messages.h"
 
 #include "msgpack.h"
 
 #define LARGEST_STAMP INT64_MAX
 
-static ieee754 read_finite(struct reader *reader)
+/* What no sensor can say: the bounds of src/caneflow/messages/bounds.py, as the bits of doubles. */
+#define TURN_RATE UINT64_C(0x40c3880000000000)           /* 10000 rad/s */
+#define ACCELERATION UINT64_C(0x40af400000000000)        /* 4000 m/s^2 */
+#define LINEAR_ACCELERATION UINT64_C(0x40af540000000000) /* 4010 m/s^2 */
+#define COSINE UINT64_C(0x3ff8000000000000)              /* 1.5: the norm is looked at later */
+#define SPEED UINT64_C(0x4059000000000000)               /* 100 m/s */
+#define SPREAD UINT64_C(0x408f400000000000)              /* 1000 m/s */
+#define DELAY UINT64_C(0x404e000000000000)               /* 60 s */
+#define RAYS UINT64_C(1000000)
+
+#define SIGN (UINT64_C(1) << 63)
+#define INFINITE UINT64_C(0x7ff0000000000000)
+
+/* A number within -most to most. The bits of doubles without their sign are in the order of the doubles. */
+static ieee754 read_within(struct reader *reader, ieee754 most)
 {
     ieee754 value = read_number(reader);
-    if (!is_finite(value))
+    if ((value & ~SIGN) > most)
         reader->failed = true;
     return value;
 }
 
-/* Fixed number of finite numbers, or nil; whether there were any. */
-static bool read_vector(struct reader *reader, ieee754 *values, unsigned count)
+/* A number from 0 to most. */
+static ieee754 read_up_to(struct reader *reader, ieee754 most)
+{
+    ieee754 value = read_within(reader, most);
+    if (value > SIGN) /* -0 is 0 */
+        reader->failed = true;
+    return value;
+}
+
+/* Fixed number of numbers within -most to most, or nil; whether there were any. */
+static bool read_vector(struct reader *reader, ieee754 *values, unsigned count, ieee754 most)
 {
     if (read_nil(reader))
         return false;
     if (read_array(reader) != count)
         reader->failed = true;
     for (unsigned i = 0; i < count && !reader->failed; i++)
-        values[i] = read_finite(reader);
+        values[i] = read_within(reader, most);
     return !reader->failed;
 }
 
@@ -57,13 +81,13 @@ bool read_imu(const uint8_t *data, size_t size, struct imu *imu)
             read_unsigned(&reader);
             has_seq = true;
         } else if (is_text(key, "gyro")) {
-            has_gyro = read_vector(&reader, gyro, 3);
+            has_gyro = read_vector(&reader, gyro, 3, TURN_RATE);
         } else if (is_text(key, "accel")) {
-            imu->has_accel = read_vector(&reader, imu->accel, 3);
+            imu->has_accel = read_vector(&reader, imu->accel, 3, ACCELERATION);
         } else if (is_text(key, "linear_accel")) {
-            imu->has_linear_accel = read_vector(&reader, imu->linear_accel, 3);
+            imu->has_linear_accel = read_vector(&reader, imu->linear_accel, 3, LINEAR_ACCELERATION);
         } else if (is_text(key, "orientation")) {
-            imu->has_orientation = read_vector(&reader, imu->orientation, 4);
+            imu->has_orientation = read_vector(&reader, imu->orientation, 4, COSINE);
         } else {
             skip_value(&reader);
         }
@@ -88,22 +112,23 @@ bool read_ground_speed(const uint8_t *data, size_t size, struct ground_speed *gr
             read_unsigned(&reader);
             has_seq = true;
         } else if (is_text(key, "speed")) {
-            ground->speed = read_finite(&reader);
+            ground->speed = read_within(&reader, SPEED);
             has_speed = true;
         } else if (is_text(key, "quality")) {
-            ieee754 quality = read_number(&reader); /* 0 or more, infinite when there is none */
-            if (is_not_a_number(quality) || quality > UINT64_C(1) << 63)
+            ieee754 quality = read_up_to(&reader, INFINITE); /* infinite when there is none */
+            if (quality != INFINITE && (quality & ~SIGN) > SPREAD)
                 reader.failed = true;
             has_quality = true;
         } else if (is_text(key, "rays")) {
-            read_unsigned(&reader);
+            if (read_unsigned(&reader) > RAYS)
+                reader.failed = true;
             has_rays = true;
         } else if (is_text(key, "valid")) {
             ground->valid = read_bool(&reader);
             has_valid = true;
         } else if (is_text(key, "delay")) {
             if (!read_nil(&reader))
-                ground->delay = read_finite(&reader);
+                ground->delay = read_up_to(&reader, DELAY);
         } else {
             skip_value(&reader);
         }

@@ -19,7 +19,7 @@ from caneflow.messages import Imu, decode
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.imu_csv import COLUMNS, UNITS, ImuTable, Reading, assignments
 from caneflow.recording import Recording
-from tools.import_imu_csv import imu_csv
+from tools.import_imu_csv import MOST, imu_csv
 
 CHECKS = Path(__file__).parents[1].parent / "shared" / "checks"
 NAMES = {"time": "t", **{name: name for name in COLUMNS[1:7]}}
@@ -28,8 +28,10 @@ HEADER = "t,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 Import = Callable[..., str]
 
 
-def table(*rows: str, units: dict[str, str] | None = None, header: str = HEADER) -> ImuTable:
-    return ImuTable([header, *rows], columns=NAMES, units=units or {})
+def table(
+    *rows: str, units: dict[str, str] | None = None, header: str = HEADER, most: dict[str, float] | None = None
+) -> ImuTable:
+    return ImuTable([header, *rows], columns=NAMES, units=units or {}, most=most)
 
 
 def test_a_row_becomes_a_reading_in_si_units() -> None:
@@ -136,13 +138,26 @@ def test_an_assignment_twice_is_refused() -> None:
         assignments("time=a,time=b", COLUMNS)
 
 
+def test_a_row_that_no_sensor_can_say_is_counted() -> None:
+    """Beyond the bounds that a sample has, in the table's units: 5000 g and 10^6 deg/s."""
+    units = {"gyro": "deg/s", "accel": "g"}
+    rows = table(
+        "0,0,0,0,0,0,1", "0.01,0,1e6,0,0,0,1", "0.02,0,0,0,0,0,-5000", "0.03,0,0,0,1,0,0", units=units, most=MOST
+    )
+    assert [reading.stamp for reading in rows.readings()] == [0, 30_000_000]
+    assert str(rows.refusals) == (
+        "2 rows refused: 1 with gyro beyond 10000 rad/s (first in line 3), "
+        "1 with accel beyond 4000 m/s^2 (first in line 4)"
+    )
+
+
 cells = st.one_of(st.floats().map(repr), st.text(max_size=5), st.integers(-(10**6), 10**6).map(str))
 
 
 @given(lines=st.lists(st.lists(cells, max_size=9).map(",".join), max_size=30))
 @settings(deadline=None)
 def test_whatever_the_rows_are_each_is_a_sound_reading_or_counted(lines: list[str]) -> None:
-    rows = table(*lines)
+    rows = table(*lines, most=MOST)
     readings = list(rows.readings())
     stamps = [reading.stamp for reading in readings]
     assert stamps == sorted(set(stamps))

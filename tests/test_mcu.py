@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import threading
@@ -20,7 +21,18 @@ from caneflow.algorithms.luenberger import LuenbergerSettings
 from caneflow.algorithms.luenberger_fixed import METHOD, FixedLuenbergerObserver, observer_constants
 from caneflow.algorithms.rotations import Vector
 from caneflow.errors import CaneflowError
-from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, RadarFrame, Sample, decode, encode, with_number
+from caneflow.messages import (
+    GroundSpeed,
+    Imu,
+    MessageError,
+    Pose,
+    RadarFrame,
+    Sample,
+    bounds,
+    decode,
+    encode,
+    with_number,
+)
 from caneflow.messages.rig import read_rig
 from caneflow.protocols.uart_frames import NUMBERS, Deframer, Frame, Kind, Status, framed, pose_answer, reset, status
 from caneflow.recording import Recording
@@ -260,7 +272,7 @@ def ground_speed() -> GroundSpeedOperator:
 
 
 def hostile(count: int, seed: int) -> list[Sample]:
-    """Samples that no cane gives: huge and tiny numbers, gaps, lulls, floods of speeds, what may be absent absent."""
+    """Samples that no cane gives, up to their bounds: huge and tiny numbers, gaps, lulls, floods of speeds, nothing."""
     rng = np.random.default_rng(seed)
     samples: list[Sample] = []
     stamp = 10**9
@@ -268,6 +280,7 @@ def hostile(count: int, seed: int) -> list[Sample]:
         stamp += int(rng.choice([1, 10_000_000, 499_999_999, 500_000_000, 500_000_001, 10**10, 2**46], p=WEIGHTS))
         for _ in range(int(rng.choice([0, 1, 2, 30], p=[0.3, 0.5, 0.15, 0.05]))):
             speed, delay = (rng.normal(0, 1, 2) * 10.0 ** rng.integers(-12, 12, 2)).tolist()
+            speed, delay = min(max(speed, -bounds.SPEED), bounds.SPEED), min(abs(delay), bounds.DELAY)
             valid, late = bool(rng.random() < 0.8), int(rng.choice([0, 1, -5_000_000]))
             quality = float(rng.choice([0.0, 0.3, np.inf]))
             samples.append(
@@ -283,7 +296,8 @@ def hostile(count: int, seed: int) -> list[Sample]:
             )
         q = rng.normal(0, 1, 4) if rng.random() < 0.9 else np.eye(4)[rng.integers(4)] * rng.choice([-1.0, 1.0])
         w, x, y, z = (q / np.linalg.norm(q) * (1 + rng.uniform(-9e-4, 9e-4))).tolist()
-        a, b, c = (rng.normal(0, 1, 3) * 10.0 ** rng.integers(-10, 5, 3)).tolist()
+        wild = rng.normal(0, 1, 3) * 10.0 ** rng.integers(-10, 5, 3)
+        a, b, c = np.clip(wild, -bounds.ACCELERATION, bounds.ACCELERATION).tolist()
         g = (0.0, -0.0, 5e-324)
         absent = rng.random() < 0.2
         samples.append(
@@ -461,7 +475,7 @@ def test_messages_in_all_of_msgpacks_ways_are_read_as_in_python(on_this_computer
         msgpack.packb(plain),
         msgpack.packb(plain, use_single_float=True),
         msgpack.packb({**unknown, **plain, "accel": None, "mag": [1.0, 2.0, 3.0]}),
-        msgpack.packb({**plain, "linear_accel": None, "accel": [-(2**31), 2**53 - 1, -129]}),
+        msgpack.packb({**plain, "linear_accel": None, "accel": [-(2**11), 4000, -129]}),
         msgpack.packb({**plain, **{f"k{i}": msgpack.ExtType(5, bytes(1 << i)) for i in range(6)}, "s" * 40: 1}),
         b"\xde\x00\x05" + msgpack.packb(plain)[1:],
         b"\xdf\x00\x00\x00\x05" + msgpack.packb(plain)[1:].replace(b"\x93", b"\xdc\x00\x03", 1),
@@ -483,6 +497,9 @@ def test_what_is_no_message_is_refused_and_the_session_goes_on(on_this_computer:
             for key, value in [("stamp", -1), ("stamp", 2**63), ("stamp", 1.0), ("gyro", [0.0] * 4)]
         ),
         *({**good, "linear_accel": [0.0, each, 0.0]} for each in (nan, inf, -inf, None, "1", True, 2**60)),
+        *({**good, "linear_accel": [0.0, each, 0.0]} for each in (1e200, -1e30, 4010.1, -4011, 2**53)),
+        {**good, "gyro": [0.0, 0.0, -10000.1]},
+        {**good, "accel": [4000.1, 0.0, 0.0]},
         {**good, "orientation": [1.0, 0.0, 0.0]},
         {**good, "orientation": 1.0},
     ]
@@ -501,6 +518,38 @@ def test_what_is_no_message_is_refused_and_the_session_goes_on(on_this_computer:
     assert [frame.number for frame in frames] == list(range(len(bodies)))
     assert [frame.body for frame in frames[:-2]] == refused
     assert (frames[-2].kind, frames[-1].kind, frames[-1].body) == (Kind.POSE, Kind.REFUSED, b"\x05")
+
+
+def test_the_bounds_of_the_sources_are_those_of_python() -> None:
+    found = re.findall(r"#define (\w+) UINT64_C\(0x([0-9a-f]{16})\)", (MCU / "messages.c").read_text())
+    values = {name: struct.unpack(">d", bytes.fromhex(bits))[0] for name, bits in found}
+    assert values.pop("COSINE") > 1 + bounds.UNIT_TOLERANCE
+    assert values.pop("INFINITE") == np.inf
+    assert values == {name: getattr(bounds, name) for name in values}
+    assert {"TURN_RATE", "ACCELERATION", "LINEAR_ACCELERATION", "SPEED", "SPREAD", "DELAY"} == values.keys()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"speed": 100.1}, {"speed": -1e200}, {"quality": 1000.5}, {"quality": -1e-300}, {"delay": -0.001},
+        {"delay": 60.5}, {"delay": 1e308}, {"rays": 1_000_001},
+    ],
+)  # fmt: skip
+def test_a_speed_that_python_refuses_changes_nothing(on_this_computer: list[str], change: dict[str, float]) -> None:
+    good = {"stamp": 10**9, "seq": 0, "speed": 1.0, "quality": 0.1, "rays": 9, "valid": True, "delay": 0.3}
+    with pytest.raises(MessageError):
+        decode(msgpack.packb({**good, **change}), GroundSpeed)
+    samples = walk()[2 * FIRST : 2 * FIRST + 20]
+    good["stamp"] = samples[10].stamp
+    frames = numbered(samples)
+
+    def with_speed(fields: dict[str, float]) -> list[tuple[bytes, bool, bool]]:
+        inserted = framed(Kind.GROUND_SPEED, NUMBERS - 1, msgpack.packb(fields))
+        return said(answers(on_this_computer, RESET + b"".join([*frames[:10], inserted, *frames[10:]]))[0])
+
+    assert with_speed({**good, **change}) == model(samples)
+    assert with_speed(good) != model(samples)
 
 
 def test_damaged_messages_are_taken_only_if_python_takes_them_or_they_lie_in_what_is_not_read(

@@ -25,7 +25,7 @@ Row = tuple[str, type[Sample], bytes, int, int, int]  # key, kind, payload, stam
 
 
 def imu(stamp: int) -> Imu:
-    return Imu(stamp=stamp, gyro=(0.1, 0.2, stamp / 1e9))
+    return Imu(stamp=stamp, gyro=(0.1, 0.2, stamp % 10**9 / 1e9))
 
 
 def frame(stamp: int) -> RadarFrame:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from caneflow.errors import CaneflowError
-from caneflow.messages import NAME, NAME_RULE, Imu, numbered, sample_key
+from caneflow.messages import NAME, NAME_RULE, Imu, bounds, numbered, sample_key
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
 from caneflow.protocols.errors import ProtocolError
@@ -16,6 +16,8 @@ from caneflow.protocols.imu_csv import COLUMNS, UNITS, ImuTable, Reading, assign
 from caneflow.recording import RecordingWriter
 
 GIVEN_UNITS = "; ".join(f"{quantity}: {', '.join(units)}" for quantity, units in UNITS.items())
+
+MOST = {"gyro": bounds.TURN_RATE, "accel": bounds.ACCELERATION, "mag": bounds.MAGNETIC_FIELD}  # that a sample may have
 
 
 def imu_csv(
@@ -70,7 +72,7 @@ def imu_csv(
         table.open(encoding="utf-8-sig", errors="replace", newline="") as lines,
     ):
         try:
-            rows = ImuTable(lines, columns=wanted, units=told, delimiter=delimiter)
+            rows = ImuTable(lines, columns=wanted, units=told, delimiter=delimiter, most=MOST)
         except ProtocolError as error:
             raise CaneflowError(f"{table}: {error}") from error
         count, last = _write(recording, flow, stream, table, rows)

@@ -13,8 +13,9 @@ from msgspec import Meta
 
 from caneflow.messages.arrays import Array
 
-# rad/s: the fastest gyros of their kind end at 4000 deg/s = 70 rad/s (ICM-20649), the BNO055's numbers at 36.
-TURN_RATE = 100.0
+# rad/s, 95 000 turns a minute: the BNO055's numbers end at 36, the fastest gyros at 20 000 deg/s = 349 (ADXRS649).
+# So wide a margin lets programs that try a flow out count in this field, as they do; a wild turn is for the gates.
+TURN_RATE = 1e4
 # m/s^2: accelerometers for impacts end at 400 g = 3923 m/s^2 (H3LIS331DL), the BNO055's numbers at 328.
 ACCELERATION = 4000.0
 LINEAR_ACCELERATION = ACCELERATION + 10.0  # m/s^2: the same less gravity, in any attitude
@@ -35,7 +36,7 @@ COVARIANCE = 1e16  # m^2, m^2/s^2: the square of more than twice round the earth
 # Elements of radar scans that are no integers: integers of 32 bits are written as floats as well; twice their range.
 SCAN = 2.0**32
 SCAN_PERIOD = (1e-6, 60.0)  # s: pulses of a fast radar; one scan a minute follows nothing that moves
-RANGE_START = (-100.0, 1e5)  # m: cables shift it by metres, no radar that sees people looks further
+RANGE_START = (-1e6, 1e6)  # m: as far as the numbers of a P440 go (32 bits of ps are 322 km), with margin
 RANGE_STEP = (1e-5, 1000.0)  # m: far finer than any wavelength; far coarser than any person
 CARRIER = (1e6, 1e12)  # Hz: radio; radars for people use 0.4 to 140 GHz
 BANDWIDTH = (1.0, 1e12)  # Hz: no wider than the carrier; 1 Hz is 150 000 km of resolution
@@ -46,7 +47,7 @@ AMPLITUDE = 1e6  # of a line in such sound, with margin for an I and a Q
 SAMPLE_RATE = (1.0, 1e8)  # Hz: no Doppler below; faster than any converter behind a Doppler module
 RANGE_RATE = 1000.0  # m/s: three times the speed of sound
 SNR = 400.0  # dB: more than the largest float32 over the last bit of 24
-TARGET_RANGE = 1e5  # m: as RANGE_START
+TARGET_RANGE = 1e6  # m: as RANGE_START
 
 
 def _within(least: float, most: float) -> Meta:

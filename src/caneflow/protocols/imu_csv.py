@@ -73,8 +73,11 @@ class ImuTable:
         columns: Mapping[str, str],
         units: Mapping[str, str],
         delimiter: str = ",",
+        most: Mapping[str, float] | None = None,
     ) -> None:
+        """`most`: by vector the greatest magnitude of a component, in SI units (mag: uT), that a reading may have."""
         self.refusals = Refusals()
+        self._most = most or {}
         self._lines = iter(lines)
         self._delimiter = delimiter
         header = self._cells(next(self._lines, ""))
@@ -142,6 +145,9 @@ class ImuTable:
             raise _BadRowError("with a cell that is no number") from None
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
             raise _BadRowError("with a number that is not finite")
+        most = self._most.get(name, math.inf)
+        if max(abs(x), abs(y), abs(z)) > most:
+            raise _BadRowError(f"with {name} beyond {most:g} {DEFAULT_UNITS[name]}")
         return x, y, z
 
 
