@@ -34,6 +34,7 @@ HAND_OVER = 0.1  # s
 OLDEST = 1.0  # s by which a piece may be older than its call; a card that says more does not know
 CLOCK_SET = 1_000_000  # ns by which the host's clock must differ from what it was to have been set
 REPORT_PERIOD = 60.0  # s
+QUIET = 1.0  # s in which not a bit of a channel changes, until this is said: some cards begin with less
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +121,7 @@ class DopplerAdc(Source):
         self._said = ""  # the last warning
         self._blocks = self._overflows = self._overflows_told = 0
         self._next_report = 0.0  # s, monotonic
+        self._quiet: dict[int, float] = {}  # by silent channel, s without a change
 
     def samples(self) -> Brought:
         """Yield what the module gives; raises DataflowError when it gives nothing at the start."""
@@ -176,12 +178,27 @@ class DopplerAdc(Source):
     def _block(self, samples: Samples, stamp: int, sample_rate: float | None = None) -> DopplerBlock:
         self._blocks += 1
         self._said = ""
+        rate = sample_rate or self._settings.sample_rate
+        self._listen(samples, len(samples) / rate)
         return DopplerBlock(
             stamp=stamp,
             samples=samples,
-            sample_rate=sample_rate or self._settings.sample_rate,
+            sample_rate=rate,
             carrier=self._settings.carrier,
         )
+
+    def _listen(self, samples: Samples, seconds: float) -> None:
+        """Say of a channel that has become silent which one it is, once until it changes again."""
+        channels = self._settings.channels
+        before, silent = self._quiet, channels.silent(samples)
+        self._quiet = {channel: before.get(channel, 0.0) + seconds for channel in silent}
+        for channel, quiet in self._quiet.items():
+            if quiet >= QUIET > before.get(channel, 0.0):
+                log.warning(
+                    "%s is silent: not a bit changes for %g s; `caneflow doctor --devices` says what to try",
+                    channels.named(channel),
+                    QUIET,
+                )
 
     def _epoch(self, instant: int) -> int:
         """`instant` (ns of the steady clock) as ns of the Unix epoch."""

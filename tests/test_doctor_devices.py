@@ -298,6 +298,33 @@ def test_how_loud_a_module_is(look: Look, tmp_path: Path, name: str, state: str,
     assert "20.0 Hz, jitter" in texts(findings)
 
 
+def test_which_channel_of_two_is_silent(look: Look, tmp_path: Path) -> None:
+    frames = np.zeros((6000, 2), np.int16)
+    frames[:, 0] = np.random.default_rng(2).normal(0.0, 1000.0, 6000)
+    frames[:, 1] = 77
+    path = tmp_path / "sound.wav"
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(2)
+        file.setsampwidth(2)
+        file.setframerate(4000)
+        file.writeframes(frames.astype("<i2").tobytes())
+    findings, _ = look(module(path, quadrature=1), "south/block")
+    assert "ok channel 0 (I): loudest 0." in texts(findings)
+    assert "look channel 1 (Q) is silent: not a bit changes" in texts(findings)
+    findings, _ = look(module(path, channel=1), "south/block")
+    assert "look channel 1 is silent: not a bit changes" in texts(findings)
+    assert "is the module powered, and on channel 1?" in attempts(findings)
+
+
+def test_a_loose_wire(look: Look, tmp_path: Path) -> None:
+    samples = np.random.default_rng(2).normal(0.0, 1000.0, 6000).astype(np.int16)
+    samples[400:1600] = 0
+    findings, _ = look(module(sound(tmp_path / "sound.wav", samples)), "south/block")
+    assert findings[-1]["state"] == "look"
+    assert "% of the blocks" in findings[-1]["text"]
+    assert "a wire may be loose" in attempts(findings)
+
+
 def test_a_file_that_is_not_there_or_lacks_a_channel(look: Look, tmp_path: Path) -> None:
     (finding,), status = look(module("/nowhere.wav"), "south/block")
     assert (status, finding["text"]) == (1, "/nowhere.wav: is not there")

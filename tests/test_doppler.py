@@ -173,6 +173,89 @@ def test_time_must_go_on() -> None:
         window.update(START_NS, tone(200.0, 0.1)[:BLOCK], RATE, CARRIER)
 
 
+def test_a_silent_channel_has_no_line_and_teaches_the_floor_nothing() -> None:
+    """A constant in the middle of noise: not valid, the lowest SNR; the floor after it is the one before it."""
+    samples = 0.01 * np.random.default_rng(4).standard_normal(round(20 * RATE))
+    without = spectra(samples.astype(np.float32))
+    samples[20000:52000] = 0.25
+    found = spectra(samples.astype(np.float32))
+    silent = [one for one in found if one.silent]
+    assert 155 <= len(silent) <= 160  # 8 s, less the windows that are half full
+    lines = [predominant_line(one, DopplerLineSettings()) for one in silent]
+    assert {(line.valid, line.amplitude, line.snr, line.range_rate) for line in lines} == {(False, 0.0, -99.0, 0.0)}
+    change = 10.0 * np.log10(np.median(found[-1].floor) / np.median(without[-1].floor))
+    assert abs(change) < 1.0
+
+
+@pytest.mark.parametrize("part", ["I", "Q"])
+def test_half_a_module_tells_no_sign_so_nothing(part: str) -> None:
+    samples = tone(200.0, 0.1)
+    if part == "I":
+        samples.real = 0.3
+    else:
+        samples.imag = 0.0
+    assert all(one.silent for one in spectra(samples))
+
+
+@pytest.mark.parametrize("time_constant", [0.1, 0.3, 1.0, 5.0])
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_what_settles_slowly_is_no_line(time_constant: float, noise: float) -> None:
+    at = np.arange(round(3 * RATE)) / RATE
+    samples = 0.6 * np.exp(-at / time_constant) + noise * np.random.default_rng(6).standard_normal(len(at))
+    found = spectra(np.round(samples * 32768.0).clip(-32768, 32767).astype(np.int16))
+    assert not any(predominant_line(one, DopplerLineSettings()).valid for one in found)
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32, np.complex64])
+def test_an_impulse_in_every_window_leaves_the_line(dtype: type) -> None:
+    samples = tone(-200.0, 0.05, seconds=2.0)
+    full = 32767.0 if dtype is np.int16 else 100.0
+    scaled = samples if dtype is np.complex64 else samples.real.astype(np.float32)
+    if dtype is np.int16:
+        scaled = np.round(scaled * 32768.0).astype(np.int16)
+    scaled[50::800] = full
+    for one in spectra(scaled):
+        line = predominant_line(one, DopplerLineSettings())
+        assert line.valid
+        assert abs(line.range_rate) == pytest.approx(200.0 / 160.93, rel=0.01)
+        assert line.amplitude == pytest.approx(0.05, rel=0.02)
+
+
+def fed(*makes: tuple[float, float, int]) -> tuple[int, list[str], SlidingSpectrum]:
+    """Blocks of 50 ms of what each says: rate and carrier (Hz) and samples. -> spectra, refusals, the window."""
+    window, given, refused = SlidingSpectrum(DopplerSpectrumSettings()), 0, []
+    for index, (rate, carrier, count) in enumerate(makes):
+        samples = np.resize(tone(200.0, 0.1)[:BLOCK], count)
+        try:
+            given += window.update(START_NS + index * BLOCK_NS, samples, rate, carrier) is not None
+        except ValueError as error:
+            refused.append(str(error))
+    return given, refused, window
+
+
+@pytest.mark.parametrize("wild", [(1e200, CARRIER), (10.0, CARRIER), (8000.0, CARRIER), (RATE, 1e300), (1e7, CARRIER)])
+def test_a_block_that_says_another_rate_or_carrier_once_is_taken_for_one_of_the_others(
+    wild: tuple[float, float],
+) -> None:
+    given, refused, window = fed(*[(RATE, CARRIER, BLOCK)] * 10, (*wild, BLOCK), *[(RATE, CARRIER, BLOCK)] * 9)
+    assert (given, refused, window.gaps) == (20 - 5, [], 0)
+
+
+def test_a_block_whose_samples_are_of_another_rate_too_is_refused_and_believed_when_it_lasts() -> None:
+    makes = [(RATE, CARRIER, BLOCK)] * 10 + [(2 * RATE, CARRIER, 2 * BLOCK)] * 12
+    given, refused, _ = fed(*makes)
+    assert len(refused) == 3
+    assert "I and Q at 8000 Hz, carrier 2.4125e+10 Hz among blocks of I and Q at 4000 Hz" in refused[0]
+    assert given == (10 - 5) + (9 - 5)
+
+
+def test_a_rate_that_no_window_can_hold_is_refused_for_as_long_as_it_lasts() -> None:
+    given, refused, _ = fed(*[(1e9, CARRIER, BLOCK)] * 6)
+    assert given == 0
+    assert len(refused) == 6
+    assert "a window of 0.256 s at 1e+09 Hz" in refused[-1]
+
+
 def test_range_is_the_fourth_root() -> None:
     """Twelve decibels less are twice as far."""
     near, far = range_from_strength(0.1, 1.0), range_from_strength(0.025, 1.0)

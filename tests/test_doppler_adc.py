@@ -541,3 +541,33 @@ def test_a_stream_of_portaudio_comes_bit_for_bit(chosen: dict[str, Any], channel
     expected = (given + 1j * frames[:, 0]) / 32768 if "quadrature" in chosen else given
     assert np.array_equal(heard, expected)
     assert all(np.diff(stamps) > 0)
+
+
+# --- silence ----------------------------------------------------------------------------------------------------
+
+
+def test_a_channel_that_falls_silent_is_said_by_its_name_and_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Q stands still for 1.5 s and for another 1.2 s; I for 0.5 s, which some cards do when they begin."""
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    frames = noise(20000, 2)
+    frames[2000:8000, 1] = -7
+    frames[12000:16800, 1] = 0
+    frames[:2000, 0] = 0
+    source = made(file=str(written(tmp_path / "sound.wav", frames)), quadrature=1)
+    with closing(source.samples()) as items:
+        assert len(list(items)) == 100
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(said) == 2
+    assert all(text.startswith("channel 1 (Q) is silent: not a bit changes for 1 s") for text in said)
+
+
+def test_both_channels_are_told_apart() -> None:
+    one, two = ModuleChannels(first=3), ModuleChannels(first=0, quadrature=2)
+    assert one.silent(np.full(10, 5, np.int16)) == (3,)
+    assert one.silent(np.arange(10, dtype=np.int16)) == ()
+    assert two.silent(np.arange(10) + 0j) == (2,)
+    assert two.silent(np.arange(10) * 1j) == (0,)
+    assert two.silent(np.zeros(10, np.complex64)) == (0, 2)
+    assert (one.named(3), two.named(0), two.named(2)) == ("channel 3", "channel 0 (I)", "channel 2 (Q)")

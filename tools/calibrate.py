@@ -1,6 +1,7 @@
 """`caneflow calibrate`: fits the rig to recordings made for that."""
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,7 +97,13 @@ def starts_of(given: Sequence[str], walks: int) -> list[tuple[float, float] | No
 
 def noise_floor(empty: Path, sensor: str) -> Floats:
     """Mean power per bin, shape (B,), of one sensor in the empty room."""
-    spectra = [spectrum.power for _, spectrum in spectra_of(empty, sensor)]
+    found = spectra_of(empty, sensor)
+    spectra = [spectrum.power for _, spectrum in found if not spectrum.silent]
+    if 2 * len(spectra) < len(found):
+        silent = f"is silent in {len(found) - len(spectra)} of {len(found)} windows"
+        raise CalibrationError(
+            f"{empty}: {sensor} {silent}; the noise of an empty room is something: is it plugged in?"
+        )
     if len(spectra) < 20:
         raise CalibrationError(f"{empty}: {sensor} has {len(spectra)} windows of the empty room; it takes 20, or 1.3 s")
     return np.asarray(np.mean(spectra, axis=0), dtype=np.float64)
@@ -106,14 +113,20 @@ def spectra_of(recording: Path, sensor: str) -> list[tuple[int, DopplerSpectrum]
     """The spectra of one sensor, each with the time that it belongs to, ns."""
     spectrum = SlidingSpectrum(DopplerSpectrumSettings())
     delay = round(spectrum.delay * 1e9)
-    found = []
+    found, left_out = [], []
     with Recording(recording) as opened:
         for sample in opened.samples([(sensor, BLOCK)]):
             block = sample.decoded()
             assert isinstance(block, DopplerBlock)
-            one = spectrum.update(block.stamp, block.samples, block.sample_rate, block.carrier)
+            try:
+                one = spectrum.update(block.stamp, block.samples, block.sample_rate, block.carrier)
+            except ValueError as error:
+                left_out.append(str(error))
+                continue
             if one is not None:
                 found.append((block.stamp - delay, one))
+    if left_out:
+        print(f"{recording}: {sensor}: {len(left_out)} blocks left out: {left_out[0]}", file=sys.stderr)
     return found
 
 

@@ -36,7 +36,12 @@ class DopplerLine:
 
 
 def predominant_line(spectrum: DopplerSpectrum, settings: DopplerLineSettings) -> DopplerLine:
-    """The strongest line above the floor, between the bins by a parabola through the logarithms."""
+    """The strongest line above the floor, between the bins by a parabola through the logarithms.
+
+    A silent channel has none: not valid, of speed and amplitude 0 and the lowest SNR.
+    """
+    if spectrum.silent:
+        return DopplerLine(range_rate=0.0, amplitude=0.0, snr=LOWEST_SNR, valid=False)
     power, floor = spectrum.power, spectrum.floor
     excess = power - floor
     peak = int(np.argmax(excess))
@@ -48,12 +53,13 @@ def predominant_line(spectrum: DopplerSpectrum, settings: DopplerLineSettings) -
     # not clipped at 0: what noise has above its mean in one bin it lacks in another
     inside, energy = float(excess[near].sum()), float(excess.sum())
     share = inside / max(energy, inside) if inside > 0.0 else 0.0
+    clear = snr >= settings.least_snr and share >= settings.least_share
     range_rate = -SPEED_OF_LIGHT * frequency / (2.0 * spectrum.carrier)
     return DopplerLine(
         range_rate=range_rate if spectrum.signed else abs(range_rate),
         amplitude=math.exp(0.5 * logarithm),
         snr=snr,
-        valid=snr >= settings.least_snr and share >= settings.least_share,
+        valid=clear and bool(power[peak] > spectrum.leak[peak]),
     )
 
 

@@ -4,18 +4,23 @@ A line of amplitude A (full scale = 1) has the power A^2 in its bin, whatever th
 windows and of real and complex modules compare. The noise floor is learnt per bin, so that lamp hum and 1/f noise
 are part of it: the smallest value that the smoothed spectrum has had for a while, as a person who walks does not
 stay on one frequency (minimum statistics: R. Martin, IEEE Trans. Speech and Audio Processing 9(5), 2001).
+
+A window in which the channel, or one of I and Q, stands still for a whole period of the lowest frequency is silent:
+it has no spectrum, and the floor learns nothing from it. Single impulses and steps are taken out before the transform.
 """
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from caneflow.algorithms.glitches import JumpGate
 from caneflow.algorithms.quantities import Frequency, Time, Zero
+from caneflow.algorithms.waveform_faults import mended
 
 INT16_FULL_SCALE = 32768.0
 SMOOTHING = 0.95  # per hop, of the spectrum whose minimum is taken: 1 s at the hop of 50 ms
@@ -27,6 +32,15 @@ PARTS = 8  # of the memory; the oldest is forgotten as a whole
 BROAD = 21  # bins, 40 Hz; a line fills 4
 SMEAR = 30.0  # over the lower quartile of the floor, 15 dB: as much as 1/f noise may rise at the low end
 LEAST_POWER = 1e-16  # of full scale: far below the last bit of any converter
+# What drifts or settles slowly has most of its power below the band. Of an exponential, and of a straight line, a Hann
+# window lets at most -19 dB of it through beyond 2.4 cells, and 18 dB an octave less farther off (worked out for time
+# constants above 0.1 s; the window's own side lobes: F. Harris, Proc. IEEE 66(1), 1978).
+LEAK = 10.0**-1.8
+LEAK_FROM = 2.4  # cells, 1 / window
+LARGEST_WINDOW = 1 << 20  # samples: 5 s of a sound card's 192 kHz
+FORGOTTEN = 1.0  # s without a block, after which one of another make is believed at once
+
+Make: TypeAlias = tuple[float, float, bool]  # sample rate and carrier (Hz), I and Q: the same in all blocks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +65,8 @@ class DopplerSpectrum:
     signed: bool  # whether the module tells approaching from receding
     carrier: float  # Hz
     noise_bandwidth: float  # bins that one line's power is spread over: sum of `power` / noise_bandwidth = energy
+    leak: NDArray[np.float64]  # shape (B,), the most power that what lies below the band may show there
+    silent: bool  # the channel carried nothing; `power` is 0
 
 
 class SlidingSpectrum:
@@ -60,8 +76,10 @@ class SlidingSpectrum:
         if settings.lowest >= settings.highest:
             raise ValueError(f"the band is {settings.lowest:g} to {settings.highest:g} Hz; it has no width")
         self._settings = settings
-        self._make: tuple[object, ...] = ()  # what may not change between blocks
-        self._last_ns: int | None = None
+        self._make: Make | None = None
+        self._makes: JumpGate[Make] = JumpGate(0.0, lambda a, b: float(a != b), longest_gap=FORGOTTEN)
+        self._last_ns: int | None = None  # stamp of the last block
+        self._seen_ns: int | None = None  # the same, of one that was refused as well
         self.gaps = 0  # how many times samples were missing between blocks
 
     @property
@@ -80,14 +98,23 @@ class SlidingSpectrum:
             sample_rate: Hz.
             carrier: Hz.
 
+        A block of another make than the ones before, for three blocks in a row at most, is one by mistake: where its
+        stamp fits its samples at the rate before, it is taken for one of that make.
+
         Raises:
-            ValueError: a block that is not newer than the one before, or a band that the sample rate cannot hold.
+            ValueError: a block that is not newer than the one before, a band that the sample rate cannot hold, or
+                samples of another make; nothing has changed then but what is known of makes.
         """
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"block at {stamp_ns} ns is not newer than the last, {self._last_ns} ns")
-        signed = samples.dtype.kind == "c"
-        if (sample_rate, carrier, signed) != self._make:
-            self._prepare(sample_rate, carrier, signed)
+        make = (sample_rate, carrier, samples.dtype.kind == "c")
+        before_ns, self._seen_ns = self._seen_ns, stamp_ns
+        believed = self._makes.update(stamp_ns, make)
+        if believed != make and not _fits(believed, samples, stamp_ns - (before_ns or 0)):
+            raise ValueError(f"a block of {_named(make)} among blocks of {_named(believed)}")
+        if believed != self._make:
+            self._check(believed[0])
+            self._prepare(believed)
         self._forget_over_gap(stamp_ns, len(samples))
         self._last_ns = stamp_ns
         self._take(samples)
@@ -95,14 +122,24 @@ class SlidingSpectrum:
         self._since_hop %= self._hop
         return self._spectrum() if due and self._filled == len(self._kept) else None
 
-    def _prepare(self, sample_rate: float, carrier: float, signed: bool) -> None:
+    def _check(self, sample_rate: float) -> None:
         settings = self._settings
         if 2.0 * settings.highest > sample_rate:
             raise ValueError(f"a band up to {settings.highest:g} Hz takes more than {sample_rate:g} samples a second")
+        if settings.window * sample_rate > LARGEST_WINDOW:
+            raise ValueError(
+                f"a window of {settings.window:g} s at {sample_rate:g} Hz has more than {LARGEST_WINDOW} samples"
+            )
+
+    def _prepare(self, make: Make) -> None:
+        settings = self._settings
+        sample_rate, _, signed = make
         count = round(settings.window * sample_rate)
-        self._make = sample_rate, carrier, signed
+        self._make = make
         self._kept = np.zeros(count, dtype=np.complex128 if signed else np.float64)
         self._filled = 0
+        # whatever is in the band changes within its period; a band that begins at 0 has no longest one
+        self._longest_still = round(min(sample_rate / max(settings.lowest, 1e-9), 0.5 * count))
         self._hop = max(round(settings.hop * sample_rate), 1)
         self._since_hop = 0
         self._hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(count) / count)
@@ -114,6 +151,9 @@ class SlidingSpectrum:
         in_band = (np.abs(frequencies) >= settings.lowest) & (np.abs(frequencies) <= settings.highest)
         self._bins = order[in_band[order]]
         self._frequencies = frequencies[self._bins]
+        self._below = np.flatnonzero((np.abs(frequencies) > 0.0) & (np.abs(frequencies) < settings.lowest))
+        cells = np.maximum(np.abs(self._frequencies) * settings.window, LEAK_FROM)
+        self._leak = LEAK * (LEAK_FROM / cells) ** 6
         # a real line is half at its frequency and half at the negative of it
         self._scale = ((1.0 if signed else 2.0) / self._hann.sum()) ** 2
         # Parseval: a line of power 1 gives this in sum over the bins of its lobe
@@ -122,12 +162,10 @@ class SlidingSpectrum:
 
     def _forget_over_gap(self, stamp_ns: int, count: int) -> None:
         """Start the window anew where samples are missing; half a block of jitter is none."""
-        if self._last_ns is None:
+        if self._make is None or self._last_ns is None:
             return
-        sample_rate = self._make[0]
-        assert isinstance(sample_rate, float | int)
-        elapsed = (stamp_ns - self._last_ns) * 1e-9 * sample_rate  # samples
-        if elapsed > 1.5 * count + 1.0:
+        elapsed = (stamp_ns - self._last_ns) * 1e-9 * self._make[0]  # samples
+        if elapsed > count + _jitter(count):
             self.gaps += 1
             self._filled = self._since_hop = 0
 
@@ -141,20 +179,37 @@ class SlidingSpectrum:
         self._since_hop += len(samples)
 
     def _spectrum(self) -> DopplerSpectrum:
+        assert self._make is not None
         _, carrier, signed = self._make
-        assert isinstance(carrier, float | int)
-        windowed = (self._kept - self._kept.mean()) * self._hann
-        transform = fft.fft(windowed, self._length) if signed else fft.rfft(windowed, self._length)
-        at = transform[self._bins]
-        power = self._scale * (at.real**2 + at.imag**2)
+        samples, still = self._mended(signed)
+        silent = still >= self._longest_still
+        power, below = np.zeros(len(self._bins)), 0.0
+        if not silent:
+            windowed = (samples - samples.mean()) * self._hann
+            transform = fft.fft(windowed, self._length) if signed else fft.rfft(windowed, self._length)
+            power = self._power(transform[self._bins])
+            below = float(self._power(transform[self._below]).max(initial=0.0))
         return DopplerSpectrum(
             frequencies=self._frequencies,
             power=power,
-            floor=self._floor.update(power),
-            signed=bool(signed),
+            floor=np.full(len(power), LEAST_POWER) if silent else self._floor.update(power),
+            signed=signed,
             carrier=carrier,
             noise_bandwidth=self._noise_bandwidth,
+            leak=below * self._leak,
+            silent=silent,
         )
+
+    def _power(self, lines: NDArray[np.complex128]) -> NDArray[np.float64]:
+        power: NDArray[np.float64] = self._scale * (lines.real**2 + lines.imag**2)
+        return power
+
+    def _mended(self, signed: bool) -> tuple[NDArray[np.inexact], int]:
+        """The window without impulses and steps, and how long its channel, or the quieter of I and Q, stood still."""
+        if not signed:
+            return mended(self._kept.real)
+        in_phase, quadrature = mended(self._kept.real), mended(self._kept.imag)
+        return in_phase.samples + 1j * quadrature.samples, max(in_phase.still, quadrature.still)
 
 
 class NoiseFloor:
@@ -201,7 +256,7 @@ class NoiseFloor:
         """What is both broad and far above the quiet bins is a person who walked on and on; hum is narrow."""
         broad = ndimage.median_filter(floor, size=BROAD, mode="nearest")
         highest = SMEAR * _lower_quartile(floor)
-        return np.asarray(floor * np.minimum(1.0, highest / broad), dtype=np.float64)
+        return np.asarray(floor * np.minimum(1.0, highest / np.maximum(broad, LEAST_POWER)), dtype=np.float64)
 
     @staticmethod
     def _raised(floor: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -211,3 +266,20 @@ class NoiseFloor:
 def _lower_quartile(values: NDArray[np.float64]) -> float:
     at = len(values) // 4
     return float(np.partition(values, at)[at])
+
+
+def _jitter(count: float) -> float:
+    """By how many samples the stamp of a block of `count` may be off: half a block."""
+    return 0.5 * count + 1.0
+
+
+def _fits(make: Make, samples: NDArray[np.number], elapsed_ns: int) -> bool:
+    """Whether samples may be of `make`, by their kind and the time since the block before."""
+    sample_rate, _, signed = make
+    elapsed, count = elapsed_ns * 1e-9 * sample_rate, len(samples)
+    return signed == (samples.dtype.kind == "c") and abs(elapsed - count) <= _jitter(min(elapsed, count))
+
+
+def _named(make: Make) -> str:
+    sample_rate, carrier, signed = make
+    return f"{'I and Q' if signed else 'one mixer'} at {sample_rate:g} Hz, carrier {carrier:.6g} Hz"

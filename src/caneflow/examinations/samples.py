@@ -3,17 +3,20 @@
 import math
 import statistics
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import DopplerBlock, Imu, RadarFrame, Sample
 from caneflow.messages.rig import read_rig
 from caneflow.physics import GRAVITY
+from caneflow.protocols.doppler_blocks import ModuleChannels
 from caneflow.runtime import Context, Quiet, Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.hosts.diagnosis import Finding
@@ -30,6 +33,8 @@ TO_CALIBRATE = {
     "magnetometer": "magnetometer: swing the cane in a figure of eight, away from steel",
 }
 CLIPPED = 0.001  # part of the samples
+QUIETEST = 2.0**-24  # of full scale, rms: a bit of the best converters
+SETTLING = 0.25  # part of the blocks that may be silent: some cards begin so
 
 
 def examine_samples(node: Node, seconds: float, rig: dict[str, Any]) -> Iterator[Finding]:
@@ -164,22 +169,37 @@ def _gravity_apart(sample: Imu) -> float | None:
 
 
 def _sound(node: Node, blocks: list[DopplerBlock]) -> Iterator[Finding]:
-    """How loud a module is: a dead wire and an overdriven input look alike to a spectrum."""
+    """How loud each channel of a module is: a dead wire and an overdriven input look alike to a spectrum."""
     samples = np.concatenate([block.samples for block in blocks])
     full = 2.0**15 if samples.dtype.kind == "i" else 1.0
-    parts = np.concatenate([samples.real, samples.imag]) if samples.dtype.kind == "c" else samples
-    peak = float(np.abs(parts.astype(np.float64)).max()) / full
-    rms = float(np.std(parts.astype(np.float64))) / full
-    clipped = float((np.abs(parts.astype(np.float64)) >= full * (1.0 - 2.0**-14)).mean())
-    text = f"loudest {peak:.3f} of full scale, {20 * math.log10(max(rms, 1e-6)):.0f} dB in the mean"
+    channels: ModuleChannels = getattr(node.settings, "channels", ModuleChannels())
+    parts = {channels.first: samples}
+    if samples.dtype.kind == "c":
+        channels = ModuleChannels(first=channels.first, quadrature=channels.quadrature or channels.first + 1)
+        assert channels.quadrature is not None
+        parts = {channels.first: samples.real, channels.quadrature: samples.imag}
+    quiet = Counter(channel for block in blocks for channel in channels.silent(block.samples))
+    for channel, part in parts.items():
+        name = channels.named(channel)
+        yield _channel(node, name, part.astype(np.float64) / full, quiet[channel] / len(blocks))
+
+
+def _channel(node: Node, name: str, values: NDArray[np.float64], silent: float) -> Finding:
+    """How loud one channel is, of values of full scale 1; `silent` is the part of its blocks without a change."""
+    wiring = (
+        f"is the module powered, and on {name}? its wire to the input, its ground to the input's",
+        "the input may be muted or its gain 0: alsamixer, capture (F4)",
+        f"another channel of the card: --set {node.name}.channel=...; 0 is the first",
+    )
+    if silent == 1.0 or float(np.std(values)) < QUIETEST:
+        return Finding(node=node.name, state="look", text=f"{name} is silent: not a bit changes", attempts=wiring)
+    rms, clipped = float(np.std(values)), float((np.abs(values) >= 1.0 - 2.0**-14).mean())
+    text = f"{name}: loudest {float(np.abs(values).max()):.3f} of full scale, {20 * math.log10(rms):.0f} dB in the mean"
     attempts: tuple[str, ...] = ()
-    if rms < 2.0**-15:
-        text = "silent: not a bit changes"
-        attempts = (
-            "is the module powered, and on this channel? its wire to the input, its ground to the input's",
-            "the input may be muted or its gain 0: alsamixer, capture (F4)",
-        )
+    if silent > SETTLING:
+        text += f", silent in {100 * silent:.0f} % of the blocks"
+        attempts = ("a wire may be loose, or another program mutes the input", *wiring[:2])
     elif clipped > CLIPPED:
         text += f", {100 * clipped:.1f} % of the samples at its end"
         attempts = ("less gain: alsamixer, capture (F4); or a divider before the input",)
-    yield Finding(node=node.name, state="look" if attempts else "ok", text=text, attempts=attempts)
+    return Finding(node=node.name, state="look" if attempts else "ok", text=text, attempts=attempts)

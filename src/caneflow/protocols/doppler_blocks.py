@@ -53,6 +53,19 @@ class ModuleChannels:
         samples.real, samples.imag = in_phase / scale, frames[:, self.quadrature] / scale
         return samples
 
+    def silent(self, samples: Samples) -> tuple[int, ...]:
+        """Which of the module's channels say nothing: no sample of theirs, shape (n,), differs from another."""
+        if self.quadrature is None:
+            return () if _changes(samples) else (self.first,)
+        parts = ((self.first, samples.real), (self.quadrature, samples.imag))
+        return tuple(channel for channel, part in parts if not _changes(part))
+
+    def named(self, channel: int) -> str:
+        """What to call one of them: "channel 1", and of an I/Q module which of the two it is."""
+        if self.quadrature is None:
+            return f"channel {channel}"
+        return f"channel {channel} ({'Q' if channel == self.quadrature else 'I'})"
+
 
 class BlockCutter:
     """Cuts samples that come in pieces of any length into blocks of `length`."""
@@ -83,6 +96,10 @@ class BlockCutter:
         self._count = 0
         joined: Samples = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return joined
+
+
+def _changes(values: NDArray[Any]) -> bool:
+    return bool((values != values[0]).any())
 
 
 def is_finite(samples: Samples) -> bool:
