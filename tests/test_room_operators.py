@@ -21,6 +21,7 @@ from caneflow.messages import DopplerBlock, DopplerTarget, Imu, MessageError, Po
 from caneflow.messages.rig import Rig
 from caneflow.recording import Recording, RecordingWriter
 from caneflow.runtime import Context, Refused
+from caneflow.runtime.stages.snapshot import pack, unpack
 from operators.doppler import Doppler, DopplerSettings
 from operators.room_tracker import Method, RoomTrackerOperator, RoomTrackerSettings
 from tools.calibrate import CalibrationError, calibrated, noise_floor, room_rig
@@ -377,3 +378,12 @@ def test_an_update_is_fast(method: Method, benchmark: BenchmarkFixture) -> None:
         told(operator, ("south", target(at, offset_ns=45_000_000)), ("west", target(at, offset_ns=45_000_000)))
 
     benchmark.pedantic(update, rounds=200)  # type: ignore[no-untyped-call]
+
+
+def test_a_front_end_is_brought_back_from_its_snapshot() -> None:
+    operator = front_end(sensor="south")
+    for index in range(10):
+        list(operator.handle("block", block(index)))
+    again = unpack(pack(operator, "operators.doppler"), "operators.doppler")
+    for index in range(10, 20):
+        assert list(again.handle("block", block(index))) == list(operator.handle("block", block(index)))

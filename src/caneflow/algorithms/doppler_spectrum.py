@@ -77,7 +77,7 @@ class SlidingSpectrum:
             raise ValueError(f"the band is {settings.lowest:g} to {settings.highest:g} Hz; it has no width")
         self._settings = settings
         self._make: Make | None = None
-        self._makes: JumpGate[Make] = JumpGate(0.0, lambda a, b: float(a != b), longest_gap=FORGOTTEN)
+        self._makes: JumpGate[Make] = JumpGate(0.0, apart, longest_gap=FORGOTTEN)
         self._last_ns: int | None = None  # stamp of the last block
         self._seen_ns: int | None = None  # the same, of one that was refused as well
         self.gaps = 0  # how many times samples were missing between blocks
@@ -266,6 +266,11 @@ class NoiseFloor:
 def _lower_quartile(values: NDArray[np.float64]) -> float:
     at = len(values) // 4
     return float(np.partition(values, at)[at])
+
+
+def apart(one: Make, other: Make) -> float:
+    """0 for the same make, 1 for another."""
+    return float(one != other)
 
 
 def _jitter(count: float) -> float:
