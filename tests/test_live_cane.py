@@ -234,7 +234,7 @@ def test_live_gives_the_track_of_the_replay(
     of_imu, of_radar = heard_part(given.walk, out, heard).values()
     assert of_imu > 0.5
     assert of_radar > 0.8
-    replay = ("--speed", "max", "--record", replayed)
+    replay = ("--speed", "max", "--record", replayed, "--overwrite")
     run_to_its_end("run", given.flow, *given.rig, "--replay", heard, *replay)
     distance, walked = apart(track(out, lived.begin), track(replayed, given.begin))
     assert walked > 0.3 * seconds
