@@ -542,14 +542,21 @@ def test_a_speed_that_python_refuses_changes_nothing(on_this_computer: list[str]
         decode(msgpack.packb({**good, **change}), GroundSpeed)
     samples = walk()[2 * FIRST : 2 * FIRST + 20]
     good["stamp"] = samples[10].stamp - 1  # the newest when the next IMU sample asks
-    frames = numbered(samples)
+    kinds = {Imu: Kind.IMU, GroundSpeed: Kind.GROUND_SPEED}
+    sent = [(kinds[type(each)], encode(needed(each))) for each in samples]
 
-    def with_speed(fields: dict[str, float]) -> list[tuple[bytes, bool, bool]]:
-        inserted = framed(Kind.GROUND_SPEED, NUMBERS - 1, msgpack.packb(fields))
-        return said(answers(on_this_computer, RESET + b"".join([*frames[:10], inserted, *frames[10:]]))[0])
+    def with_speed(fields: dict[str, float]) -> tuple[list[tuple[bytes, bool, bool]], int]:
+        """What the firmware said of the poses, and how often it refused a sample."""
+        all_sent = [*sent[:10], (Kind.GROUND_SPEED, msgpack.packb(fields)), *sent[10:]]
+        stream = b"".join(framed(kind, number, body) for number, (kind, body) in enumerate(all_sent))
+        frames, _ = answers(on_this_computer, RESET + stream)
+        poses = [frame for frame in frames if frame.kind == Kind.POSE]
+        return said(poses), len(frames) - len(poses)
 
-    assert with_speed({**good, **change}) == model(samples)
-    assert with_speed(good) != model(samples)
+    assert with_speed({**good, **change}) == (model(samples), 1)
+    moved, refused = with_speed(good)
+    assert refused == 0
+    assert moved != model(samples)
 
 
 def test_damaged_messages_are_taken_only_if_python_takes_them_or_they_lie_in_what_is_not_read(
