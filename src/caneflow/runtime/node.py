@@ -578,7 +578,7 @@ class _OperatorNode(_ReaderNode):
             self._next_snapshot = math.inf  # until this one is kept
             handled = {self.plan.inputs[port].key: seq for port, (seq, _) in self.stage.state().inputs.items()}
             fresh = handled != self.confirmed
-            snapshot = self.keeper.taken(self.stage.state(), self.history.kept()) if fresh else None
+            snapshot = self.taken_snapshot() if fresh else None
         self._keeps = not fresh or self.is_kept(snapshot)  # live without the lock: samples do not wait for the disk
         if self._keeps:
             with self.lock:
@@ -586,6 +586,12 @@ class _OperatorNode(_ReaderNode):
         if self._keeps or full:  # else the writers of a replay would wait for a snapshot without end
             self.confirmed = handled
         self._next_snapshot = time.monotonic() + self._snapshot_period
+
+    def taken_snapshot(self) -> bytes | None:
+        snapshot = self.keeper.taken(self.stage.state(), self.history.kept(), self.stage.operator)
+        if self.keeper.state is not None:
+            self.stage.note_packed(self.keeper.state)
+        return snapshot
 
     def is_kept(self, snapshot: bytes | None) -> bool:
         """Keep a snapshot, or None for a state that cannot be kept; whether writers may forget what it has handled.

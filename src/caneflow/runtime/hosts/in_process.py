@@ -7,6 +7,7 @@ give the same bytes.
 import heapq
 import importlib
 from collections.abc import Iterator, Mapping
+from contextvars import copy_context
 from itertools import islice
 from typing import TypeAlias
 
@@ -60,7 +61,7 @@ class InProcess:
         """The same; after a signal the outcome says so, and holds what was counted up to there."""
         outcome = Outcome()
         try:
-            self._run()
+            copy_context().run(self._run)  # numpy's errors are set for the operators, and for nobody else here
         except KeyboardInterrupt:
             outcome.interrupted = True
         finally:

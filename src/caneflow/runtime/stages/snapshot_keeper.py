@@ -57,12 +57,15 @@ class SnapshotKeeper:
         self._program = f"{self._name()}:{type(operator).__qualname__}"
         self._on_trial = False  # a snapshot was gone on from, and none was kept since
         self._failed = False  # to write one, and that was said
+        self.state: bytes | None = None  # of the operator, when it was packed last
         self._possible = True  # False: none can be taken, and that was said
         # Held open: a folder that is removed and made again by another user gets nothing of ours, and gives nothing.
         self._folder = self._opened(path.parent)
 
-    def taken(self, stage: StageState, history: dict[str, list[Kept]]) -> bytes | None:
+    def taken(self, stage: StageState, history: dict[str, list[Kept]], operator: Operator) -> bytes | None:
         """The operator's state and where its streams stand; None, said once, when the state cannot be kept."""
+        self._operator = operator  # another one after a sample that the one before could not handle
+        self.state = None
         if not self._possible:
             return None
         try:
@@ -73,6 +76,7 @@ class SnapshotKeeper:
             self._possible = False
             log.warning("cannot be brought back exactly after a kill: %s", one_line(error))
             return None
+        self.state = state
         return msgspec.msgpack.encode(
             Snapshot(caneflow.__version__, self._program, stage, history, state, layout=LAYOUT)
         )

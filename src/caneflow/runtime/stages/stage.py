@@ -4,6 +4,7 @@ Samples come in as they arrive and are checked against their stream; the operato
 emits is numbered. Nothing here knows Zenoh, processes or a clock.
 """
 
+import logging
 from collections.abc import Mapping
 from typing import Annotated, TypeAlias
 
@@ -18,8 +19,11 @@ from caneflow.runtime.program import Operator, Refused
 from caneflow.runtime.stages.byte_budget import share, weight_of
 from caneflow.runtime.stages.merge import END, Merge
 from caneflow.runtime.stages.references import SnapshotError
+from caneflow.runtime.stages.rollback import Rollback, blames_sample, let_overflow_raise
 from caneflow.runtime.stages.streams import Arrivals, Departures
-from caneflow.runtime.wording import listed
+from caneflow.runtime.wording import listed, one_line
+
+log = logging.getLogger(__name__)
 
 Number: TypeAlias = Annotated[int, Meta(ge=-1, le=END)]  # -1: none yet
 
@@ -44,6 +48,7 @@ class Stage:
         self.finished = False
         self._awaited = [out for out in self.outputs.values() if out.plan.awaited]
         self._operator = operator
+        self._rollback = Rollback(node, operator)
         self._merge = Merge(tuple(inputs))
         self._budget: int | None = None  # bytes of one port that may wait for their turn; None: not bounded
         self._held = dict.fromkeys(inputs, 0)  # bytes of those, where they are bounded
@@ -53,6 +58,11 @@ class Stage:
         self._budget = share(budget, len(self.inputs))
         for arrivals in self.inputs.values():
             arrivals.budget = self._budget
+
+    @property
+    def operator(self) -> Operator:
+        """The operator as it is now: another object after a sample that the one before could not handle."""
+        return self._operator
 
     @property
     def held(self) -> int:
@@ -116,7 +126,7 @@ class Stage:
             return self._handled(port, self.inputs[port], message, now)
         if not self.finished and self._merge.ended:
             self.finished = True
-            return [self._numbered(port, message) for port, message in self._operator.finish()]
+            return self._finished()
         return None
 
     def handle_at_once(self, port: str, message: Sample, now: int | None) -> list[tuple[str, Sample, int]] | None:
@@ -157,6 +167,7 @@ class Stage:
             if ports.keys() != found.keys():
                 raise SnapshotError(f"it has the {what} {listed(found)}; expected {listed(ports)}")
         self._operator = operator
+        self._rollback.resume(operator)
         for port, (seq, stamp) in state.inputs.items():
             arrivals = self.inputs[port]
             arrivals.handled_seq, arrivals.handled_stamp = seq, stamp
@@ -165,6 +176,10 @@ class Stage:
         for port, (sent, stamp) in state.outputs.items():
             self.outputs[port].sent, self.outputs[port].last_stamp = sent, stamp
         self.finished = state.finished
+
+    def note_packed(self, state: bytes) -> None:
+        """Take note that the operator was packed just now: a sample that it cannot handle sets it back to there."""
+        self._rollback.rebase(state)
 
     def tells_more_than_samples(self) -> bool:
         """Whether a reader waits, and cannot see from the samples alone, how far this node has come."""
@@ -210,15 +225,38 @@ class Stage:
             arrivals.counts.dropped += 1
             arrivals.leave_out(message, "dropped")
             return []
-        emitted = []
+        follows: list[tuple[str, Sample]] = []
+        let_overflow_raise()
         try:
-            for out, follows in self._operator.handle(port, message):
-                emitted.append(self._numbered(out, follows))
+            for each in self._operator.handle(port, message):
+                follows.append(each)
         except Refused as refused:
             arrivals.refuse(refused)
+        except Exception as error:
+            cause = blames_sample(error)
+            if cause is None:
+                raise
+            self._operator = self._rollback.restored(port, message, self._operator, error)
+            arrivals.refuse(cause)
+            return []
         else:
             arrivals.counts.handled += 1
-        return emitted
+        self._rollback.note(port, message, self._operator)
+        return [self._numbered(out, each) for out, each in follows]
+
+    def _finished(self) -> list[tuple[str, Sample, int]]:
+        """What the operator has left to say at the end, as far as it can be said."""
+        follows: list[tuple[str, Sample, int]] = []
+        let_overflow_raise()
+        try:
+            for out, each in self._operator.finish():
+                follows.append(self._numbered(out, each))
+        except Exception as error:
+            cause = blames_sample(error)
+            if cause is None:
+                raise
+            log.warning("%s: at its end: %s", self.node, one_line(error))
+        return follows
 
     def _numbered(self, port: str, message: Sample) -> tuple[str, Sample, int]:
         departures = self.outputs.get(port)

@@ -1,6 +1,7 @@
 """Streams at a node's edge: what arrives is held against its number and stamp, what departs is numbered."""
 
 import logging
+import re
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -23,6 +24,7 @@ FAR_AHEAD = (
 )
 FAR_AHEAD_UNKNOWN = 100 * 365 * 86_400 * 1_000_000_000  # ns, while the writer's clock is not known: 1970 to 2070
 SECOND_WRITER = 1_000  # samples of one writer between two of another, at most: more, and it was a restart
+NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]?\d+)?|\b(nan|inf)\b)")
 SILENCES_NAMED = 10  # per stream: one that is slow is not to be complained of for ever
 
 
@@ -55,9 +57,9 @@ class Arrivals:
     _silences: int = 0  # that were said
 
     def refuse(self, cause: object, kind: str = "") -> None:
-        """Count a sample that cannot be taken; name the cause once per kind of cause."""
+        """Count a sample that cannot be taken; name the cause once per kind of cause, whatever its numbers."""
         self.counts.refused += 1
-        self._say_once(kind or str(cause), f"refused: {cause}")
+        self._say_once(kind or NUMBER.sub("", str(cause)[:LONGEST_CAUSE]), f"refused: {cause}")
 
     def drop_unseen(self, count: int) -> None:
         """Count samples that were dropped before they were looked at: more came than the node may hold."""
