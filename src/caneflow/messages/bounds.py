@@ -44,7 +44,7 @@ BANDWIDTH = (1.0, 1e12)  # Hz: no wider than the carrier; 1 Hz is 150 000 km of 
 # Elements of sound that are no integers: full scale is 1, but some write the counts of 16 bits; three times those.
 SOUND = 1e5
 AMPLITUDE = 1e6  # of a line in such sound, with margin for an I and a Q
-SAMPLE_RATE = (1.0, 1e8)  # Hz: no Doppler below; faster than any converter behind a Doppler module
+SAMPLE_RATE = (10.0, 1e6)  # Hz: no Doppler below; faster than any converter behind a Doppler module (sound: 384 kHz)
 RANGE_RATE = 1000.0  # m/s: three times the speed of sound
 SNR = 400.0  # dB: more than the largest float32 over the last bit of 24
 TARGET_RANGE = 1e6  # m: as RANGE_START
