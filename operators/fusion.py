@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
-from caneflow.algorithms.dead_reckoning import DeadReckoning
+from caneflow.algorithms.dead_reckoning import DeadReckoning, require_later, required_acceleration, required_orientation
+from caneflow.algorithms.glitches import GlitchGate, Readings
+from caneflow.algorithms.ground_velocity import UNOBSERVED
 from caneflow.algorithms.kalman import KalmanFilter, KalmanSettings
 from caneflow.algorithms.luenberger import LuenbergerObserver, LuenbergerSettings
 from caneflow.algorithms.luenberger_fixed import FixedLuenbergerObserver, observer_constants
 from caneflow.algorithms.naive_ins import NaiveIns, NaiveInsSettings
+from caneflow.algorithms.speed_gate import CaneGlitchSettings, SpeedGate
 from caneflow.algorithms.step_heading import StepHeading, StepHeadingSettings
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample
 from caneflow.messages.rig import Rig
@@ -33,6 +36,7 @@ class FusionSettings:
     shs: StepHeadingSettings = field(default_factory=StepHeadingSettings)
     naive_ins: NaiveInsSettings = field(default_factory=NaiveInsSettings)
     best: CaneFilterSettings = field(default_factory=CaneFilterSettings)
+    glitches: CaneGlitchSettings = field(default_factory=CaneGlitchSettings)  # in fixed point too
 
     def __post_init__(self) -> None:
         if self.method == "luenberger_fixed":  # raises for what fixed point does not have
@@ -47,10 +51,21 @@ class Fusion(Operator):
     Settings = FusionSettings
 
     def __init__(self, settings: FusionSettings, context: Context) -> None:
+        self._settings, self._rig = settings, context.rig
         self._method = settings.method
-        self._estimator = estimator(settings, context.rig)
+        self._gate = GlitchGate(settings.glitches)
+        self._speeds, self._velocities = SpeedGate(settings.glitches), SpeedGate(settings.glitches)
+        self._held: tuple[str, ...] = ()  # what was held back of speeds since the last pose
+        self._samples = 0  # of the IMU; counted until two agree
+        self._last_ns: int | None = None  # stamp of the last
+        self._start()
+
+    def _start(self) -> None:
+        self._estimator = estimator(self._settings, self._rig)
         # The paper's methods know one speed; this one knows a velocity and the magnetic field as well.
         self._cane_filter = self._estimator if isinstance(self._estimator, CaneFilter) else None
+        # It holds wild readings by itself, as the firmware does, which gets samples as they are.
+        self._fixed = self._estimator if isinstance(self._estimator, FixedLuenbergerObserver) else None
 
     def handle(self, port: str, message: Sample) -> Emitted:
         """The pose at an IMU sample's stamp; a speed only informs the estimator."""
@@ -61,17 +76,39 @@ class Fusion(Operator):
         return ()
 
     def _take_speed(self, ground: GroundSpeed) -> None:
-        if self._cane_filter is not None and ground.velocity is not None and ground.velocity_cov is not None:
-            self._cane_filter.velocity(ground.stamp, ground.velocity, ground.velocity_cov, ground.velocity_delay)
-        self._estimator.speed(ground.stamp, ground.speed, ground.quality, ground.valid, ground.delay)
+        stamp, velocity, covariance = ground.stamp, ground.velocity, ground.velocity_cov
+        if self._cane_filter is not None and velocity is not None and covariance is not None:
+            says_nothing = min(covariance[0], covariance[2]) >= UNOBSERVED
+            if says_nothing or self._velocities.passes(stamp, *velocity, ground.velocity_delay):
+                self._cane_filter.velocity(stamp, velocity, covariance, ground.velocity_delay)
+            else:
+                self._hold("velocity")
+        if self._fixed is not None or not ground.valid or self._speeds.passes(stamp, ground.speed, 0.0, ground.delay):
+            self._estimator.speed(stamp, ground.speed, ground.quality, ground.valid, ground.delay)
+        else:
+            self._hold("speed")
+
+    def _hold(self, what: str) -> None:
+        if what not in self._held:
+            self._held += (what,)
 
     def _pose(self, imu: Imu) -> Pose:
-        if self._cane_filter is not None and imu.mag is not None:
-            self._cane_filter.magnetic_field(imu.mag)
         try:
-            estimate = self._estimator.imu(imu.stamp, imu.gyro, imu.accel, imu.orientation, imu.linear_accel)
+            self._require(imu)
         except ValueError as error:
             raise Refused(str(error)) from error
+        readings = Readings(imu.gyro, imu.accel, imu.mag, imu.orientation, imu.linear_accel)
+        if self._fixed is None:
+            readings = self._gate.update(imu.stamp, readings)
+            if self._samples < 2:
+                self._begin()
+        if self._cane_filter is not None and readings.mag is not None:
+            self._cane_filter.magnetic_field(readings.mag)
+        estimate = self._estimator.imu(
+            imu.stamp, readings.gyro, readings.accel, readings.orientation, readings.linear_accel
+        )
+        held = self._gate.held + self._held if self._fixed is None else self._fixed.held
+        self._held = ()
         return Pose(
             stamp=imu.stamp,
             position=estimate.position,
@@ -79,7 +116,23 @@ class Fusion(Operator):
             orientation=estimate.orientation,
             covariance=estimate.covariance,
             method=self._method,
+            status=" ".join([f"held:{what}" for what in held]) if held else None,
         )
+
+    def _require(self, imu: Imu) -> None:
+        """Raise ValueError for a sample that the method cannot use, before it has changed anything."""
+        require_later(imu.stamp, self._last_ns)
+        required_orientation(imu.orientation, self._method)
+        if self._method != "shs":
+            required_acceleration(imu.accel, imu.linear_accel, self._method)
+        self._last_ns = imu.stamp
+
+    def _begin(self) -> None:
+        """A walk begins at the first sample that the next one agrees with: one that does not is forgotten."""
+        if self._samples and self._gate.contradicted:
+            self._start()
+        else:
+            self._samples += 1
 
 
 def estimator(settings: FusionSettings, rig: Rig) -> DeadReckoning:

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field, fields
 from operator import attrgetter
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
+from caneflow.algorithms.dead_reckoning import require_later
 from caneflow.algorithms.footprint import CaneGeometry
+from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, Readings
 from caneflow.algorithms.ground_velocity import GroundVelocityEstimator, GroundVelocitySettings
 from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
 from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
@@ -33,6 +35,7 @@ class GroundSpeedSettings:
     with_velocity: bool = True  # fill `velocity` and `velocity_cov`, by the pulse pair
     paper: PaperSpeedSettings = field(default_factory=PaperSpeedSettings)
     ground_velocity: GroundVelocitySettings = field(default_factory=GroundVelocitySettings)
+    glitches: GlitchSettings = field(default_factory=GlitchSettings)  # of the IMU
 
     def __post_init__(self) -> None:
         if not (self.with_speed or self.with_velocity):
@@ -51,6 +54,8 @@ class GroundSpeedOperator(Operator):
         rig = geometry(context.rig)
         self._paper = PaperSpeed(settings.paper, rig) if settings.with_speed else None
         self._velocity = GroundVelocityEstimator(settings.ground_velocity, rig) if settings.with_velocity else None
+        self._gate = GlitchGate(settings.glitches)
+        self._last_ns: int | None = None  # stamp of the last IMU sample
         self._attitudes = AttitudeHistory()
         self._described: tuple[float, ...] = ()  # what the frame before said of its scans
         self._parameters: RadarParameters | None = None  # the same by name
@@ -66,9 +71,18 @@ class GroundSpeedOperator(Operator):
     def _take_attitude(self, imu: Imu) -> None:
         if imu.orientation is None:
             raise Refused("the IMU sample has no orientation; put operators.attitude in front of ground_speed")
-        self._attitudes.add(imu.stamp, imu.orientation, imu.gyro)
-        if self._velocity is not None:
-            self._velocity.imu(imu.stamp, imu.orientation, imu.accel)
+        try:
+            require_later(imu.stamp, self._last_ns)
+        except ValueError as error:
+            raise Refused(str(error)) from error
+        self._last_ns = imu.stamp
+        gyro, accel, _, orientation, _ = self._gate.update(
+            imu.stamp, Readings(imu.gyro, imu.accel, None, imu.orientation, None)
+        )
+        if orientation is not None:
+            self._attitudes.add(imu.stamp, orientation, gyro)
+            if self._velocity is not None:
+                self._velocity.imu(imu.stamp, orientation, accel)
 
     def _speed(self, frame: RadarFrame) -> GroundSpeed:
         try:

@@ -292,3 +292,36 @@ def test_covariance_is_turned_and_takes_in_heading_and_scale() -> None:
     level = [0, 1, 3, 4]
     assert got[np.ix_(level, level)] == pytest.approx(expected)
     assert not got[[2, 5]].any() and not got[:, [2, 5]].any()
+
+
+def test_a_filter_that_disagrees_with_the_radar_for_a_second_believes_it_again() -> None:
+    """A velocity that is wrong by 20 m/s, with a covariance of nothing: after 1.5 s it is right."""
+    cane = CaneFilter(CaneFilterSettings(), boresight=BORESIGHT, pivot=PIVOT)
+    rng = np.random.default_rng(5)
+    body, at_rest = held(0.0), rotate(conjugate(held(0.0)), (0.0, 0.0, GRAVITY))
+    for index in range(1000):
+        stamp_ns = START_NS + index * PERIOD_NS
+        if index == 400:
+            before = cane.imu(stamp_ns, (0.0, 0.0, 0.0), at_rest, body, None)
+            cane._motion._x[2] = 20.0
+            cane._motion._p[2:4, :] = cane._motion._p[:, 2:4] = 0.0
+            continue
+        estimate = cane.imu(stamp_ns, (0.0, 0.0, 0.0), at_rest, body, None)
+        if index % 5 == 0:
+            cane.velocity(stamp_ns, (0.5 + 0.03 * rng.normal(), 0.0), (0.0009, 0.0, UNOBSERVED), 0.0)
+        if index == 550:
+            assert estimate.velocity[0] == pytest.approx(0.5, abs=0.1)
+    moved = estimate.position[0] - before.position[0]
+    assert moved == pytest.approx(0.5 * 6.0, abs=2.0), "most of the 20 m that it went wrong are taken back as well"
+
+
+def test_a_stated_error_of_nothing_is_not_believed() -> None:
+    """A velocity counts as no better than any radar's: no covariance of 0 comes of one that says 0."""
+    body, force = held(0.0), rotate(conjugate(held(0.0)), (0.0, 0.0, GRAVITY))
+    cane = CaneFilter(CaneFilterSettings(), boresight=BORESIGHT, pivot=PIVOT)
+    for index in range(60):
+        if index % 5 == 0:
+            cane.velocity(START_NS + index * PERIOD_NS, (0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+        estimate = cane.imu(START_NS + index * PERIOD_NS, (0.0, 0.0, 0.0), force, body, None)
+    assert estimate.covariance is not None
+    assert 0.004**2 < estimate.covariance[3, 3] < 0.02**2

@@ -73,3 +73,30 @@ def test_a_sensor_without_a_part_keeps_being_without() -> None:
     gate = GlitchGate(GlitchSettings())
     bare = Readings(REST, None, None, None, None)
     assert [gate.update(index * PERIOD_NS, bare) for index in range(3)] == [bare] * 3
+
+
+def test_where_nothing_was_seen_yet_a_wider_limit_holds() -> None:
+    gate: JumpGate[float] = JumpGate(1.0, lambda a, b: abs(a - b), start=0.0, unseen_limit=4.0)
+    assert [gate.update(index * PERIOD_NS, value) for index, value in enumerate((90.0, 3.0, 3.1))] == [0.0, 3.0, 3.1]
+    after_gap = 1_000_000_000
+    assert gate.update(after_gap, 7.5) == 3.1, "4.4 from the last good one"
+    assert gate.update(after_gap + PERIOD_NS, 6.5) == 6.5, "3.4: across a gap that may be"
+    assert gate.update(2 * after_gap, 2.6) == 2.6
+
+
+def test_the_second_of_two_that_differ_says_so_while_neither_is_confirmed() -> None:
+    gate: JumpGate[float] = JumpGate(1.0, lambda a, b: abs(a - b))
+    said = []
+    for index, value in enumerate((9.0, 0.0, 0.1, 9.0, 0.0)):
+        gate.update(index * PERIOD_NS, value)
+        said.append(gate.contradicted)
+    assert said == [False, True, False, False, False]
+
+
+def test_a_sensor_that_begins_with_its_full_scale_is_held_at_rest() -> None:
+    gate = GlitchGate(GlitchSettings())
+    first = Readings((35.7, 0.0, 0.0), WILD, None, None, WILD)
+    assert gate.update(0, first) == Readings(REST, (0.0, 0.0, 9.80665), None, None, REST)
+    turned = Readings((0.1, 0.0, 0.0), (9.8, 0.0, 0.0), None, None, REST)
+    assert gate.update(PERIOD_NS, turned) == turned
+    assert not gate.held

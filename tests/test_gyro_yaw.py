@@ -66,3 +66,17 @@ def test_over_a_gap_the_chips_yaw_holds() -> None:
     yaw.update(0.0, held(1.0), (0.0, 0.0, 0.0), 0.0, 1.0)
     assert yaw.offset == 0.0
     assert yaw.level_biases() is None
+
+
+@pytest.mark.parametrize("wild", ["gyro", "orientation"])
+@pytest.mark.parametrize("interval", [0.0, 0.01])
+def test_a_wild_sample_at_the_start_or_after_a_gap_turns_nothing(wild: str, interval: float) -> None:
+    yaw = GyroYaw()
+    if interval == 0.0:  # after a gap
+        yaw.update(0.0, held(0.0), (0.0, 0.0, 0.0), 0.0, 1.0)
+    gyro: Vector = (0.0, 35.7, 35.7) if wild == "gyro" else (0.0, 0.0, 0.0)
+    yaw.update(0.0, held(0.4) if wild == "orientation" else held(0.0), gyro, 0.0, 1.0)
+    for _ in range(3):
+        yaw.update(0.01, held(0.0), (0.0, 0.0, 0.0), 0.0, 1.0)
+    assert yaw.offset == 0.0
+    assert yaw.level_biases() is None

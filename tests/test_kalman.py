@@ -260,6 +260,16 @@ def test_noise_from_quality_is_its_scale_times_the_quality_above_the_floor(quali
     assert ends[0] == pytest.approx(ends[1])
 
 
+def test_a_speed_of_no_quality_says_nothing() -> None:
+    kalman = forward(KalmanSettings(noise_from_quality=True))
+    for k in range(30):
+        kalman.speed(START_NS + k * PERIOD_NS, 1.0, math.inf, True, None)
+        end = kalman.imu(START_NS + k * PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
+    assert end.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+    assert end.covariance is not None
+    assert np.isfinite(end.covariance).all()
+
+
 def test_an_open_path_leads_along_the_boresights_yaw() -> None:
     yaw = math.radians(30.0)
     kalman = KalmanFilter(KalmanSettings(), boresight=(0.0, 1.0, 0.0))

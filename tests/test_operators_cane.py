@@ -28,7 +28,11 @@ def context(rig: Rig) -> Context:
 
 def samples() -> Iterator[tuple[str, Sample]]:
     """Frames and IMU readings of the walk, in event time."""
-    made, imu = walk(), walk().imu
+    return samples_of(walk())
+
+
+def samples_of(made: Walk) -> Iterator[tuple[str, Sample]]:
+    imu = made.imu
     for i, stamp in enumerate(made.stamps_ns.tolist()):
         yield (
             "frame",

@@ -35,3 +35,16 @@ def test_after_a_gap_it_waits() -> None:
     for index in range(100):
         detector.update(START_NS + index * 10_000_000, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert not detector.update(START_NS + 10_000_000_000, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def test_what_has_left_the_window_has_left_nothing_behind() -> None:
+    """One reading of 1e10 m/s^2 squared is 1e20: a float sum keeps some 1e4 of it, and a still hand never stands."""
+    detector, fresh = StandingDetector(StandingSettings()), StandingDetector(StandingSettings())
+    detector.update(START_NS - 10_000_000_000, (1e10, 0.0, 0.0), (1e10, -1e10, 1e10))
+    for index in range(300):
+        t = index / 100
+        rate, up = (0.0, 0.0, 0.02), (0.03, -0.05, (0.1 if t < 1.5 else 0.4) * math.sin(2 * math.pi * 1.1 * t))
+        stamp_ns = START_NS + index * 10_000_000
+        stands = detector.update(stamp_ns, rate, up)
+        assert stands == fresh.update(stamp_ns, rate, up) or index < 62, "the full window comes sooner after a gap"
+    assert not stands

@@ -37,6 +37,9 @@ class CaneFilterSettings:
     # s over which radar velocities err alike (their window, and the speckle they stand on): as white noise, those
     # that come more often are worth less each
     velocity_correlation: Time = 0.04
+    # m/s, sd of a radar velocity at the least, whatever it states: the best of 20 walks was 0.02
+    velocity_error: Speed = 0.015
+    disagreement: Time = 1.0  # s of outliers alone, after which the radar is believed again
     speed_noise: Density = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
     speed_patience: Time = 0.5  # s without a velocity before the paper's speed is taken instead
     sideways: Speed = 0.1  # m/s, sd of the hand's velocity across the way the cane points
@@ -116,6 +119,9 @@ class CaneFilter:
         self._gained = 0j  # m/s since the start
         self._acceleration = 0j  # m/s^2 in the gyro's frame, of the last sample
         self._last_velocity_ns: int | None = None
+        self._disagree_ns: int | None = None  # stamp of the first of the outliers that the last velocities were
+        self._lonely = False  # the last velocity came after a silence
+        self._sees_left = False  # the last velocity observed its component to the left
         self._radar_speed = 0.0  # m/s, the last
         self._field: Vector | None = None  # uT, body
         self._since_heading = self._since_sideways = 0.0  # s
@@ -152,13 +158,20 @@ class CaneFilter:
     ) -> None:
         """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
         (forward, left), (xx, _, yy) = velocity, covariance
+        # one sample alone that sees the way sideways while it moves is not believed: from the second on it is
+        sees_left, self._sees_left = self._sees_left, yy < _UNOBSERVED
+        if not sees_left and velocity != (0.0, 0.0):
+            yy = _UNOBSERVED
         if min(xx, yy) < _UNOBSERVED:
-            share = 1.0
-            if self._last_velocity_ns is not None:
-                since = (stamp_ns - self._last_velocity_ns) * 1e-9
-                share = min(since / self._settings.velocity_correlation, 1.0)
-            self._last_velocity_ns = stamp_ns
-            if share > 0.0:
+            least = self._settings.velocity_error**2
+            xx, yy = max(xx, least), max(yy, least)
+            last_ns, self._last_velocity_ns = self._last_velocity_ns, stamp_ns
+            since = (stamp_ns - last_ns) * 1e-9 if last_ns is not None else math.inf
+            share = min(since / self._settings.velocity_correlation, 1.0)
+            # the first after a silence may be a wild one, which the next will show; at rest that does no harm
+            was_lonely = self._lonely
+            self._lonely = lonely = since > self._settings.speed_patience and velocity != (0.0, 0.0)
+            if share > 0.0 and (was_lonely or not lonely):
                 self._waiting.append(_Measured(stamp_ns, delay or 0.0, forward, left, xx / share, yy / share))
 
     def magnetic_field(self, mag: Vector) -> None:
@@ -236,9 +249,23 @@ class CaneFilter:
             sides = ((facing, measured.forward, measured.xx), (facing * 1j, measured.left, measured.yy))
             for direction, value, variance in sides:
                 if variance < _UNOBSERVED:
-                    moved = (since * direction.conjugate()).real
-                    self._motion.observe_velocity((direction.real, direction.imag), value + moved, variance)
+                    self._observe(measured.stamp_ns, direction, value + (since * direction.conjugate()).real, variance)
             self._radar_speed = measured.forward
+
+    def _observe(self, stamp_ns: int, direction: complex, value: float, variance: float) -> None:
+        """Correct by the radar. When the filter has called all it says an outlier for long, the filter is wrong."""
+        along = direction.real, direction.imag
+        if self._motion.observe_velocity(along, value, variance) < self._settings.motion.outlier:
+            self._disagree_ns = None
+            return
+        if self._disagree_ns is None:
+            self._disagree_ns = stamp_ns
+        lasting = (stamp_ns - self._disagree_ns) * 1e-9
+        if lasting > self._settings.disagreement:
+            vx, vy = self._motion.velocity
+            self._motion.doubt(abs(value - along[0] * vx - along[1] * vy), lasting)
+            self._motion.observe_velocity(along, value, variance)
+            self._disagree_ns = None
 
     def _instant(self, stamp_ns: int) -> _Instant:
         """Between the samples about a time; the oldest kept when that is not as old."""

@@ -59,16 +59,20 @@ class SampleClock:
 
     def interval(self, stamp_ns: int) -> float | None:
         """Seconds since the sample before, None at the first; raises ValueError when time does not go on."""
+        require_later(stamp_ns, self._last_ns)
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if last_ns is None:
             return None
-        if stamp_ns <= last_ns:
-            self._last_ns = last_ns
-            raise ValueError(f"imu: stamp {stamp_ns} ns is not after the one before, {last_ns} ns")
         interval = (stamp_ns - last_ns) * 1e-9
         if interval > LONGEST_INTERVAL:
             self.gaps += 1
         return interval
+
+
+def require_later(stamp_ns: int, last_ns: int | None) -> None:
+    """Raise ValueError unless an IMU sample's stamp is after that of the sample before, `last_ns`, if there is one."""
+    if last_ns is not None and stamp_ns <= last_ns:
+        raise ValueError(f"imu: stamp {stamp_ns} ns is not after the one before, {last_ns} ns")
 
 
 def required_orientation(orientation: Quaternion | None, method: str) -> Quaternion:
@@ -81,6 +85,15 @@ def required_orientation(orientation: Quaternion | None, method: str) -> Quatern
     return orientation
 
 
+def required_acceleration(accel: Vector | None, linear_accel: Vector | None, method: str) -> Vector:
+    """The one without gravity (m/s^2, body) where there is one, else the other; ValueError when there is neither."""
+    if linear_accel is not None:
+        return linear_accel
+    if accel is None:
+        raise ValueError(f"{method}: the imu sample has neither linear_accel nor accel; it needs one of them")
+    return accel
+
+
 def world_acceleration(
     orientation: Quaternion, accel: Vector | None, linear_accel: Vector | None, method: str
 ) -> Vector:
@@ -88,12 +101,8 @@ def world_acceleration(
 
     Raises ValueError when there is neither `linear_accel` nor `accel`.
     """
-    if linear_accel is not None:
-        return rotate(orientation, linear_accel)
-    if accel is None:
-        raise ValueError(f"{method}: the imu sample has neither linear_accel nor accel; it needs one of them")
-    x, y, z = rotate(orientation, accel)
-    return x, y, z - GRAVITY
+    x, y, z = rotate(orientation, required_acceleration(accel, linear_accel, method))
+    return (x, y, z) if linear_accel is not None else (x, y, z - GRAVITY)
 
 
 def heading_of(orientation: Quaternion, boresight: Vector) -> tuple[float, float]:

@@ -15,6 +15,9 @@ _SCALE_ACROSS: Final = math.radians(0.01)  # rad/s, sd of what scale errors leav
 _SCALE_ALONG: Final = math.radians(0.04)  # and along: there two axes with different scales share every turn
 
 
+_APART: Final = math.radians(120.0)  # rad/s, between gyro and chip, from which on one of them is wild
+
+
 class GyroYaw:
     """What the gyro turned more than the chip says; its state is the last sample and three sums."""
 
@@ -22,6 +25,7 @@ class GyroYaw:
         self._orientation: Quaternion | None = None
         self._gyro: Vector = (0.0, 0.0, 0.0)
         self._elapsed = 0.0
+        self._begins = True  # no two samples have agreed since the start or a gap
         self._across = self._along = 0.0  # rad
         self.offset = 0.0  # rad, gyro's yaw less the chip's
 
@@ -29,8 +33,11 @@ class GyroYaw:
         """Take a sample `interval` s after the last one; (cos, sin) of the boresight's yaw by the chip.
 
         With an interval of 0 nothing is compared: at the start, and after a gap, over which the chip's yaw holds.
+        Nor is it as long as gyro and chip contradict each other there: a wild first sample would turn all that follows.
         """
-        if self._orientation is not None and interval > 0.0:
+        if self._orientation is None or interval <= 0.0:
+            self._begins = True
+        else:
             turned = _rotation_vector(multiply(conjugate(self._orientation), orientation))
             half = 0.5 * interval
             x, y, z = rotate(
@@ -41,10 +48,12 @@ class GyroYaw:
                     half * (gyro[2] + self._gyro[2]) - turned[2],
                 ),
             )
-            self.offset += z
-            self._along += cos_yaw * x + sin_yaw * y
-            self._across += cos_yaw * y - sin_yaw * x
-            self._elapsed += interval
+            if not self._begins or max(abs(x), abs(y), abs(z)) <= _APART * interval:
+                self._begins = False
+                self.offset += z
+                self._along += cos_yaw * x + sin_yaw * y
+                self._across += cos_yaw * y - sin_yaw * x
+                self._elapsed += interval
         self._orientation, self._gyro = orientation, gyro
 
     def level_biases(self) -> tuple[float, float, float, float] | None:

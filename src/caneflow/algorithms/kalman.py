@@ -6,6 +6,7 @@ Q and R are the same on every axis, so one covariance of (a, v, p) serves all th
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from caneflow.algorithms.rotations import Quaternion, Vector
 
 INITIAL_ACCELERATION = 3.0  # m/s^2, sd before the first sample and after a gap: the swing's own
 INITIAL_VELOCITY = 1.0  # m/s, sd likewise: somewhere between standing and walking
+_NO_QUALITY: Final = 1e3  # m/s, a quality that says no more than infinity does
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +231,7 @@ class KalmanFilter:
         settings = self._settings
         if not settings.noise_from_quality:
             return settings.speed_noise**2
-        return (settings.quality_scale * max(quality, settings.quality_floor)) ** 2
+        return (settings.quality_scale * min(max(quality, settings.quality_floor), _NO_QUALITY)) ** 2
 
     def _covariance(self) -> NDArray[np.float64]:
         """(6, 6) of position and velocity: the filter's own plus the slow errors' in the plane."""

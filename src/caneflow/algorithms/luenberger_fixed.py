@@ -181,6 +181,7 @@ class FixedLuenbergerObserver:
         self._remainder: Integers = (0, 0, 0)  # of the position, 2**-36 m
         self._flagged = False  # something was cut since the last estimate
         self.saturated = False  # likewise, until the last estimate
+        self.held: tuple[str, ...] = ()
         self.gaps = 0  # intervals longer than LONGEST_INTERVAL_NS
 
     @property

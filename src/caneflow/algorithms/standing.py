@@ -7,9 +7,12 @@ A standing hand drifts and trembles (some 0.1 m/s^2, a few deg/s); a walking one
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Final
 
 from caneflow.algorithms.quantities import Acceleration, Time, TurnRate
 from caneflow.algorithms.rotations import Vector
+
+_ONE: Final = 2**32  # rad/s and m/s^2 are counted in steps of 1 / _ONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,22 +25,24 @@ class StandingSettings:
 
 
 class StandingDetector:
-    """Sums over a sliding window."""
+    """Sums over a sliding window, in whole numbers: what has left the window has left no rounding behind."""
 
     def __init__(self, settings: StandingSettings) -> None:
         self._settings = settings
-        self._samples: deque[tuple[int, float, float, float, float]] = deque()
-        self._sums = (0.0,) * 7  # of turn rate, accelerations, and their squares
+        self._samples: deque[tuple[int, int, int, int, int]] = deque()
+        self._sums = (0,) * 7  # of turn rate, accelerations, and their squares
 
     def update(self, stamp_ns: int, gyro: Vector, acceleration: Vector) -> bool:
         """Take a sample: turn rate (rad/s) and acceleration in R0 without gravity (m/s^2)."""
-        sample = (stamp_ns, math.sqrt(gyro[0] ** 2 + gyro[1] ** 2 + gyro[2] ** 2), *acceleration)
+        turning = math.sqrt(gyro[0] ** 2 + gyro[1] ** 2 + gyro[2] ** 2)
+        x, y, z = acceleration
+        sample = stamp_ns, int(turning * _ONE), int(x * _ONE), int(y * _ONE), int(z * _ONE)
         self._samples.append(sample)
-        self._add(sample, 1.0)
+        self._add(sample, 1)
         window_ns = round(self._settings.window * 1e9)
         full = False
         while self._samples[0][0] <= stamp_ns - window_ns:
-            self._add(self._samples.popleft(), -1.0)
+            self._add(self._samples.popleft(), -1)
             full = True
         return full and self._is_still()
 
@@ -45,13 +50,13 @@ class StandingDetector:
         count = len(self._samples)
         if count < 4:  # a gap
             return False
-        if self._sums[0] / count > self._settings.largest_turn_rate:
+        if self._sums[0] / (count * _ONE) > self._settings.largest_turn_rate:
             return False
-        limit = self._settings.largest_acceleration**2
-        means = [value / count for value in self._sums]
-        return all(means[axis + 3] - means[axis] ** 2 <= limit for axis in (1, 2, 3))
+        limit = (self._settings.largest_acceleration * count * _ONE) ** 2
+        sums = self._sums
+        return all(count * sums[axis + 3] - sums[axis] ** 2 <= limit for axis in (1, 2, 3))
 
-    def _add(self, sample: tuple[int, float, float, float, float], sign: float) -> None:
+    def _add(self, sample: tuple[int, int, int, int, int], sign: int) -> None:
         _, turning, x, y, z = sample
         turned, sx, sy, sz, sxx, syy, szz = self._sums
         dx, dy, dz = sign * x, sign * y, sign * z

@@ -8,6 +8,7 @@ The gyro's frame turns with the errors of the gyro; a turn of a degree in three 
 it does to the track is the business of heading_hypotheses.py.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -101,8 +102,11 @@ class WalkMotion:
 
     def observe_velocity(
         self, along: tuple[float, float], value: float, variance: float, *, per_pointing: float = 0.0
-    ) -> None:
-        """Correct by the velocity's component `along` a direction, m/s, plus `per_pointing` times beta."""
+    ) -> float:
+        """Correct by the velocity's component `along` a direction, m/s, plus `per_pointing` times beta.
+
+        Returns by how many standard deviations it was off.
+        """
         (nx, ny), x = along, self._x
         ph = nx * self._p[:, _VX] + ny * self._p[:, _VY]
         expected = nx * x[_VX] + ny * x[_VY]
@@ -111,11 +115,21 @@ class WalkMotion:
             expected += per_pointing * x[_BETA]
         spread = float(nx * ph[_VX] + ny * ph[_VY] + per_pointing * ph[_BETA]) + variance
         innovation = value - expected
+        off = abs(innovation) / math.sqrt(spread)
         # an outlier is believed to be as uncertain as it is far off
         spread = max(spread, (innovation / self._settings.outlier) ** 2)
         gain = ph / spread
         self._x = [a + g * innovation for a, g in zip(x, gain.tolist(), strict=True)]
         self._p -= gain[:, None] * ph
+        return off
+
+    def doubt(self, speed: float, lasting: float) -> None:
+        """The velocity may be off by `speed` (m/s, sd per axis), and may have been for `lasting` s."""
+        for position, velocity in ((_PX, _VX), (_PY, _VY)):
+            self._p[velocity, velocity] += speed**2
+            self._p[position, position] += (speed * lasting) ** 2
+            self._p[position, velocity] += speed**2 * lasting
+            self._p[velocity, position] += speed**2 * lasting
 
     def _bias_in(self, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
         forward, left = self._x[_BF], self._x[_BL]
