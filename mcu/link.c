@@ -50,7 +50,11 @@ static void answer_pose(struct link *link, const struct imu *imu, uint32_t began
         pose.velocity[i] = double_from_fixed(observer->velocity[i], 25);
     }
     for (int i = 0; i < 4; i++)
-        pose.orientation[i] = imu->orientation[i];
+        pose.orientation[i] = observer->orientation[i];
+    pose.held_orientation = observer->held & HELD_ORIENTATION;
+    pose.held_accel = observer->held & HELD_ACCELERATION && !imu->has_linear_accel;
+    pose.held_linear_accel = observer->held & HELD_ACCELERATION && imu->has_linear_accel;
+    pose.held_speed = observer->held & HELD_SPEED;
     uint8_t *at = link->answer;
     *at++ = (uint8_t)((observer->saturated ? FLAG_SATURATED : 0) | (observer->gap ? FLAG_GAP : 0));
     uint8_t *ticks = at;

@@ -144,14 +144,36 @@ static uint8_t *write_vector(uint8_t *at, const char *key, const ieee754 *values
     return at;
 }
 
+/* The word behind those that are there already. */
+static char *add_word(char *end, const char *text, const char *word)
+{
+    if (end != text)
+        *end++ = ' ';
+    while (*word != '\0')
+        *end++ = *word++;
+    *end = '\0';
+    return end;
+}
+
 size_t write_pose(const struct pose *pose, uint8_t *data)
 {
-    uint8_t *at = write_map(data, 6);
+    char status[48] = "", *end = status; /* the longest is 45 */
+    if (pose->held_orientation)
+        end = add_word(end, status, "held:orientation");
+    if (pose->held_accel)
+        end = add_word(end, status, "held:accel");
+    if (pose->held_linear_accel)
+        end = add_word(end, status, "held:linear_accel");
+    if (pose->held_speed)
+        end = add_word(end, status, "held:speed");
+    uint8_t *at = write_map(data, end == status ? 6 : 7);
     at = write_unsigned(write_text(at, "stamp"), (uint64_t)pose->stamp);
     at = write_unsigned(write_text(at, "seq"), pose->seq);
     at = write_vector(at, "position", pose->position, 3);
     at = write_vector(at, "velocity", pose->velocity, 3);
     at = write_vector(at, "orientation", pose->orientation, 4);
     at = write_text(write_text(at, "method"), "luenberger_fixed");
+    if (end != status)
+        at = write_text(write_text(at, "status"), status);
     return (size_t)(at - data);
 }

@@ -29,9 +29,10 @@ struct pose {
     ieee754 position[3];    /* m, R0 */
     ieee754 velocity[3];    /* m/s, R0 */
     ieee754 orientation[4]; /* w x y z, body to world */
+    bool held_orientation, held_accel, held_linear_accel, held_speed; /* for the status */
 };
 
-#define LONGEST_POSE 192 /* bytes */
+#define LONGEST_POSE 232 /* bytes */
 
 /* False for anything that is not one whole message of its kind. Unknown keys are skipped. */
 bool read_imu(const uint8_t *data, size_t size, struct imu *imu);

@@ -226,10 +226,17 @@ uint8_t *write_array(uint8_t *at, unsigned items)
 
 uint8_t *write_text(uint8_t *at, const char *text)
 {
-    uint8_t *head = at++;
-    while (*text != '\0')
-        *at++ = (uint8_t)*text++;
-    *head = (uint8_t)(0xa0 | (at - head - 1));
+    unsigned size = 0;
+    while (text[size] != '\0')
+        size++;
+    if (size < 32) {
+        *at++ = (uint8_t)(0xa0 | size);
+    } else {
+        *at++ = TEXT8;
+        *at++ = (uint8_t)size;
+    }
+    for (unsigned i = 0; i < size; i++)
+        *at++ = (uint8_t)text[i];
     return at;
 }
 

@@ -32,7 +32,7 @@ bool is_text(struct text text, const char *expected);
 /* Each returns the place behind what it wrote. */
 uint8_t *write_map(uint8_t *at, unsigned pairs);   /* up to 15 */
 uint8_t *write_array(uint8_t *at, unsigned items); /* up to 15 */
-uint8_t *write_text(uint8_t *at, const char *text); /* up to 31 characters */
+uint8_t *write_text(uint8_t *at, const char *text); /* up to 255 characters */
 uint8_t *write_unsigned(uint8_t *at, uint64_t value);
 uint8_t *write_double(uint8_t *at, ieee754 value);
 

@@ -23,6 +23,17 @@
 #define UNIT_TOLERANCE (INT64_C(1) << (2 * UNIT - 8))
 #define GRAVITY INT32_C(41132071) /* 9.80665 m/s^2, Q9.22 */
 
+/* What counts as wild. */
+#define MOST_HELD 3                                     /* samples in a row */
+#define SAMPLE_GAP INT64_C(50000000)                    /* ns, between IMU samples */
+#define SPEED_GAP INT64_C(500000000)                    /* ns, between speeds */
+#define LARGEST_JUMP INT64_C(41943040)                  /* 10 m/s^2, Q9.22 */
+#define LEAST_COSINE INT64_C(1148534290205298944)       /* of half of 10 degrees, Q3.60 */
+#define SPEED_JUMP (INT64_C(1) << VELOCITY)             /* 1 m/s */
+#define UNSEEN_SPEED (INT64_C(3) << VELOCITY)           /* 3 m/s, at the start and across a gap */
+#define DELAY_JUMP INT64_C(100000000)                   /* ns */
+#define UNSEEN_DELAY INT64_C(1000000000)                /* ns, at the start and across a gap */
+
 static const int32_t boresight[3] = {OBSERVER_BORESIGHT_X, OBSERVER_BORESIGHT_Y, OBSERVER_BORESIGHT_Z};
 
 static int32_t cut(struct observer *observer, int64_t value)
@@ -31,6 +42,29 @@ static int32_t cut(struct observer *observer, int64_t value)
         return (int32_t)value;
     observer->flagged = true;
     return value > 0 ? LARGEST : -LARGEST;
+}
+
+/* Whether a value is to be held: `near` its last good one, or at least as near as it may be across a gap (`likely`). */
+static bool must_hold(struct gate *gate, int64_t stamp, int64_t longest_gap, bool near, bool likely)
+{
+    bool follows = gate->started && stamp - gate->last <= longest_gap;
+    bool confirmed = follows && gate->confirmed;
+    gate->started = true;
+    gate->last = stamp;
+    near = near && follows;
+    if (!near && (confirmed || !likely) && gate->held < MOST_HELD) {
+        gate->confirmed = confirmed;
+        gate->held++;
+        return true;
+    }
+    gate->confirmed = near;
+    gate->held = 0;
+    return false;
+}
+
+static bool is_within(int64_t difference, int64_t limit)
+{
+    return difference <= limit && difference >= -limit;
 }
 
 /* The world vector for a body `v` in any format, by a quaternion in Q1.30. */
@@ -74,6 +108,53 @@ static struct heading heading_of(const int32_t unit[4], int64_t stamp)
         heading.sin = (int32_t)quotient(world[1] * (INT64_C(1) << UNIT), norm);
     }
     return heading;
+}
+
+/* The attitude of a sample; the last good one in the place of one that is turned away from it by too much. */
+static bool take_orientation(struct observer *observer, const struct imu *imu, const int32_t unit[4])
+{
+    int64_t cosine = 0;
+    for (int i = 0; i < 4; i++)
+        cosine += (int64_t)unit[i] * observer->unit[i];
+    bool near = !is_within(cosine, LEAST_COSINE - 1);
+    if (must_hold(&observer->orientations, imu->stamp, SAMPLE_GAP, near, true))
+        return false;
+    for (int i = 0; i < 4; i++) {
+        observer->unit[i] = unit[i];
+        observer->orientation[i] = imu->orientation[i];
+    }
+    return true;
+}
+
+/* Whether an acceleration in R0 is near enough to the last good one to be taken. */
+static bool takes_acceleration(struct observer *observer, int64_t stamp, const int64_t world[3])
+{
+    int64_t square = 0;
+    bool near = true;
+    for (int i = 0; i < 3; i++) {
+        int64_t difference = world[i] - observer->measured[i];
+        if (is_within(difference, LARGEST_JUMP))
+            square += difference * difference;
+        else
+            near = false;
+    }
+    near = near && square <= LARGEST_JUMP * LARGEST_JUMP;
+    return !must_hold(&observer->accelerations, stamp, SAMPLE_GAP, near, near);
+}
+
+/* Whether neither a speed nor its delay is wild. */
+static bool takes_speed(struct observer *observer, int64_t stamp, int32_t speed, int64_t delay)
+{
+    int64_t faster = (int64_t)speed - observer->good_speed, later = delay - observer->good_delay;
+    bool wild = must_hold(&observer->speeds, stamp, SPEED_GAP, is_within(faster, SPEED_JUMP),
+                          is_within(faster, UNSEEN_SPEED));
+    if (!wild)
+        observer->good_speed = speed;
+    bool wildly_late = must_hold(&observer->delays, stamp, SPEED_GAP, is_within(later, DELAY_JUMP),
+                                 is_within(later, UNSEEN_DELAY));
+    if (!wildly_late)
+        observer->good_delay = delay;
+    return !wild && !wildly_late;
 }
 
 static void remember_heading(struct observer *observer, struct heading heading)
@@ -171,25 +252,47 @@ void observer_speed(struct observer *observer, const struct ground_speed *ground
 {
     if (!ground->valid)
         return;
+    int32_t lag = fixed_from_double(ground->delay, DELAY, LARGEST, &observer->flagged);
+    int32_t speed = fixed_from_double(ground->speed, VELOCITY, LARGEST_INPUT, &observer->flagged);
+    int64_t delay = product(lag, NANOSECONDS, DELAY);
+    if (!takes_speed(observer, ground->stamp, speed, delay)) {
+        observer->held_speed = HELD_SPEED;
+        return;
+    }
     if (observer->waiting_count == WAITING) { /* the oldest goes */
         observer->first_waiting = (observer->first_waiting + 1) % WAITING;
         observer->waiting_count--;
     }
-    int32_t delay = fixed_from_double(ground->delay, DELAY, LARGEST, &observer->flagged);
-    struct waiting_speed speed = {
-        ground->stamp,
-        product(delay, NANOSECONDS, DELAY),
-        fixed_from_double(ground->speed, VELOCITY, LARGEST_INPUT, &observer->flagged),
-    };
-    observer->waiting[(observer->first_waiting + observer->waiting_count) % WAITING] = speed;
+    struct waiting_speed waiting = {ground->stamp, delay, speed};
+    observer->waiting[(observer->first_waiting + observer->waiting_count) % WAITING] = waiting;
     observer->waiting_count++;
+}
+
+/* The sample's acceleration in R0, without gravity; notes what is wild, and where it has to be held. */
+static void take_sample(struct observer *observer, const struct imu *imu, const int32_t unit[4], int64_t world[3])
+{
+    const ieee754 *acceleration = imu->has_linear_accel ? imu->linear_accel : imu->accel;
+    int32_t body[3];
+    observer->held = observer->held_speed;
+    observer->held_speed = 0;
+    if (!take_orientation(observer, imu, unit))
+        observer->held |= HELD_ORIENTATION;
+    for (int i = 0; i < 3; i++)
+        body[i] = fixed_from_double(acceleration[i], ACCELERATION, LARGEST_INPUT, &observer->flagged);
+    rotate(observer->unit, body, world);
+    if (!imu->has_linear_accel)
+        world[2] -= GRAVITY;
+    if (takes_acceleration(observer, imu->stamp, world))
+        return;
+    observer->held |= HELD_ACCELERATION;
+    for (int i = 0; i < 3; i++)
+        world[i] = observer->measured[i];
 }
 
 enum refusal observer_imu(struct observer *observer, const struct imu *imu)
 {
-    int32_t unit[4], body[3];
+    int32_t unit[4];
     int64_t world[3];
-    const ieee754 *acceleration = imu->has_linear_accel ? imu->linear_accel : imu->accel;
     if (!imu->has_orientation)
         return NO_ORIENTATION;
     if (!take_unit(imu->orientation, unit))
@@ -198,17 +301,13 @@ enum refusal observer_imu(struct observer *observer, const struct imu *imu)
         return NO_ACCELERATION;
     if (observer->started && imu->stamp <= observer->last)
         return NOT_LATER;
-    for (int i = 0; i < 3; i++)
-        body[i] = fixed_from_double(acceleration[i], ACCELERATION, LARGEST_INPUT, &observer->flagged);
-    rotate(unit, body, world);
-    if (!imu->has_linear_accel)
-        world[2] -= GRAVITY;
+    take_sample(observer, imu, unit, world);
     observer->gap = false;
     if (observer->started)
         advance(observer, imu->stamp);
     observer->started = true;
     observer->last = imu->stamp;
-    remember_heading(observer, heading_of(unit, imu->stamp));
+    remember_heading(observer, heading_of(observer->unit, imu->stamp));
     for (int i = 0; i < 3; i++)
         observer->measured[i] = (int32_t)world[i];
     observer->saturated = observer->flagged;

@@ -23,8 +23,24 @@ struct heading {
     int32_t sin;   /* Q1.30 */
 };
 
+/* What of the last sample, and of the speeds before it, was wild and held back. */
+enum held { HELD_ORIENTATION = 1, HELD_ACCELERATION = 2, HELD_SPEED = 4 };
+
+/* When to hold one quantity at its last good value; see JumpGate in src/caneflow/algorithms/glitches.py. */
+struct gate {
+    int64_t last; /* ns, stamp of the last value, good or held */
+    uint8_t held; /* in a row */
+    bool started;
+    bool confirmed; /* the last good value had one before it that agreed */
+};
+
 struct observer {
     int64_t last; /* ns, stamp of the last IMU sample */
+    struct gate orientations, accelerations, speeds, delays;
+    ieee754 orientation[4]; /* w x y z, the last good one as it came */
+    int32_t unit[4];        /* Q1.30, the same */
+    int32_t good_speed;     /* Q6.25, m/s */
+    int64_t good_delay;     /* ns */
     struct waiting_speed waiting[WAITING];
     struct heading headings[HISTORY];
     unsigned first_waiting, waiting_count;
@@ -34,6 +50,8 @@ struct observer {
     int32_t velocity[3];     /* Q6.25, m/s, R0 */
     int32_t position[3];     /* Q11.20, m, R0 */
     uint16_t remainder[3];   /* 2^-36 m, of the position */
+    uint8_t held_speed; /* HELD_SPEED when one was held since the last estimate */
+    uint8_t held;       /* of the last estimate, see enum held */
     bool started;
     bool flagged;   /* something was cut to its format since the last estimate */
     bool saturated; /* likewise, until the last estimate */

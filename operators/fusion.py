@@ -36,7 +36,7 @@ class FusionSettings:
     shs: StepHeadingSettings = field(default_factory=StepHeadingSettings)
     naive_ins: NaiveInsSettings = field(default_factory=NaiveInsSettings)
     best: CaneFilterSettings = field(default_factory=CaneFilterSettings)
-    glitches: CaneGlitchSettings = field(default_factory=CaneGlitchSettings)  # in fixed point too
+    glitches: CaneGlitchSettings = field(default_factory=CaneGlitchSettings)  # fixed point has their defaults
 
     def __post_init__(self) -> None:
         if self.method == "luenberger_fixed":  # raises for what fixed point does not have

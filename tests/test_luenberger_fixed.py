@@ -106,14 +106,14 @@ def both(settings: LuenbergerSettings | None = None) -> tuple[FixedLuenbergerObs
 
 
 def restless(count: int, seed: int) -> Iterator[tuple[int, Quaternion, Vector, float | None]]:
-    """Stamp, orientation, linear acceleration and speed (or none) of a walk that nobody walks, gaps included."""
+    """Stamp, orientation, linear acceleration and speed (or none): no walk, but never a jump; gaps included."""
     rng = np.random.default_rng(seed)
     stamp = START_NS
     tilt = normalized((0.9, -0.4, 0.05, 0.0))
     for k in range(count):
         stamp += 700_000_000 if k % 300 == 299 else int(rng.integers(1_000_000, 30_000_000))
-        x, y, z = rng.normal(0.0, 2.0, 3).tolist()
-        yield stamp, multiply(from_yaw(0.004 * k), tilt), (x, y, z), float(rng.uniform(0, 1.5)) if k % 3 else None
+        x, y, z = rng.normal(0.0, 1.0, 3).tolist()
+        yield stamp, multiply(from_yaw(0.004 * k), tilt), (x, y, z), float(rng.uniform(0, 0.9)) if k % 3 else None
 
 
 GAIN = ((0.4, 0.1), (0.012, 0.06))

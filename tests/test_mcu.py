@@ -233,6 +233,7 @@ def model(samples: Sequence[Sample], settings: LuenbergerSettings | None = None)
                 velocity=got.velocity,
                 orientation=got.orientation,
                 method=METHOD,
+                status=" ".join(f"held:{what}" for what in observer.held) or None,
             )
             made.append((encode(pose), observer.saturated, observer.gaps > gaps))
     return made
@@ -362,6 +363,29 @@ def test_the_sources_agree_with_the_model_whatever_comes(on_this_computer: list[
     assert said(frames) == expected
     assert 20 < sum(saturated for _, saturated, _ in expected) < len(expected)
     assert sum(gap for _, _, gap in expected) > 20
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_the_sources_hold_what_the_model_holds(on_this_computer: list[str], seed: int) -> None:
+    """A walk in which every fourth sample is a hostile one, two or three in a row among them, and some are lost."""
+    rng = np.random.default_rng(seed)
+    wild: dict[type[Sample], list[Sample]] = {
+        kind: [each for each in hostile(300, seed) if type(each) is kind] for kind in (Imu, GroundSpeed)
+    }
+    samples: list[Sample] = []
+    for each in walk():
+        if rng.random() < 0.25:
+            other = wild[type(each)][int(rng.integers(200))]
+            samples.append(msgspec.structs.replace(other, stamp=each.stamp, seq=each.seq))
+        elif rng.random() < 0.98:
+            samples.append(each)
+    frames, _ = answers(on_this_computer, RESET + b"".join(numbered(samples)))
+    expected = model(samples)
+    assert said(frames) == expected
+    statuses = [decode(pose, Pose).status or "" for pose, _, _ in expected]
+    for word in ("held:orientation", "held:accel", "held:linear_accel", "held:speed"):
+        assert sum(word in status.split() for status in statuses) > 5, word
+    assert statuses.count("") > 100
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,7 @@ class Firmware:
             velocity=made.velocity,
             orientation=made.orientation,
             method=METHOD,
+            status=" ".join(f"held:{what}" for what in self.observer.held) or None,
         )
         self.poses += 1
         return Kind.POSE, bytes(9) + encode(pose)

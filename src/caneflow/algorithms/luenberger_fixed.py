@@ -16,8 +16,10 @@ from collections import deque
 from typing import Final, NamedTuple, TypeAlias
 
 from caneflow.algorithms.dead_reckoning import PoseEstimate, required_orientation
+from caneflow.algorithms.glitches import JumpGate
 from caneflow.algorithms.luenberger import LuenbergerSettings
 from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.algorithms.speed_gate import LONGEST_GAP
 from caneflow.physics import GRAVITY
 
 METHOD: Final = "luenberger_fixed"
@@ -45,6 +47,13 @@ SHORTEST_HEADING = 2**10  # 1e-6, Q1.30: a boresight with less horizontal part p
 UNIT_TOLERANCE = 2 ** (2 * UNIT - 8)  # of a quaternion's squared norm, Q3.60: twice what messages are held to
 GRAVITY_FIXED = round(GRAVITY * 2**ACCELERATION)
 
+# What counts as wild: the defaults of CaneGlitchSettings, and like those held for three samples at most.
+LARGEST_JUMP = 10 * 2**ACCELERATION  # m/s^2, of the acceleration without gravity, in R0
+LEAST_COSINE = round(math.cos(math.radians(5.0)) * 2 ** (2 * UNIT))  # of half of 10 degrees, between two attitudes
+SPEED_JUMP, UNSEEN_SPEED = 1 * 2**VELOCITY, 3 * 2**VELOCITY  # m/s
+DELAY_JUMP, UNSEEN_DELAY = 100_000_000, 1_000_000_000  # ns
+RULES = 2  # raised when the firmware is to compute something else from the same constants
+
 Integers: TypeAlias = tuple[int, int, int]
 
 
@@ -62,8 +71,8 @@ class ObserverConstants(NamedTuple):
     @property
     def digest(self) -> int:
         """32 bits that tell these constants from others: a host asks the firmware for them."""
-        values = (*self[:5], *self.boresight, self.heading_at_delay)
-        return crc32(struct.pack(">9i", *values))
+        values = (*self[:5], *self.boresight, self.heading_at_delay, RULES)
+        return crc32(struct.pack(">10i", *values))
 
 
 def observer_constants(settings: LuenbergerSettings, boresight: Vector) -> ObserverConstants:
@@ -145,6 +154,9 @@ def rotated(unit: tuple[int, int, int, int], vector: Integers) -> Integers:
     )
 
 
+_Attitude: TypeAlias = tuple[tuple[int, int, int, int], Quaternion]  # in Q1.30, and as it came
+
+
 # --- the observer ---------------------------------------------------------------------------------------------------
 
 
@@ -165,6 +177,7 @@ class FixedLuenbergerObserver:
 
     Takes and gives SI floats, as the other methods do: rounded to the format on the way in, exact on the way out.
     `saturated`: whether something was cut to its format in the last estimate or in a speed since the one before.
+    `held`: what of the last sample, and of the speeds before it, was wild and held back (glitches.py).
     `gaps`: how many intervals were longer than LONGEST_INTERVAL_NS.
     """
 
@@ -181,6 +194,17 @@ class FixedLuenbergerObserver:
         self._remainder: Integers = (0, 0, 0)  # of the position, 2**-36 m
         self._flagged = False  # something was cut since the last estimate
         self.saturated = False  # likewise, until the last estimate
+        self._orientations: JumpGate[_Attitude] = JumpGate(-LEAST_COSINE, _unlikeness)
+        self._accelerations: JumpGate[Integers] = JumpGate(
+            LARGEST_JUMP**2, _apart, start=(0, 0, 0), unseen_limit=LARGEST_JUMP**2
+        )
+        self._speeds: JumpGate[int] = JumpGate(
+            SPEED_JUMP, _difference, longest_gap=LONGEST_GAP, start=0, unseen_limit=UNSEEN_SPEED
+        )
+        self._delays: JumpGate[int] = JumpGate(
+            DELAY_JUMP, _difference, longest_gap=LONGEST_GAP, start=0, unseen_limit=UNSEEN_DELAY
+        )
+        self._held_speed = False  # since the last estimate
         self.held: tuple[str, ...] = ()
         self.gaps = 0  # intervals longer than LONGEST_INTERVAL_NS
 
@@ -193,10 +217,14 @@ class FixedLuenbergerObserver:
         """Take a new ground speed (m/s); the observer has no use for its quality (m/s)."""
         if not valid:
             return
-        lag = self._taken(delay or 0.0, DELAY, LARGEST)
-        self._waiting.append(
-            _Speed(stamp_ns, self._taken(speed, VELOCITY, LARGEST_INPUT), product(lag, NANOSECONDS, DELAY))
-        )
+        delay_ns = product(self._taken(delay or 0.0, DELAY, LARGEST), NANOSECONDS, DELAY)
+        taken = self._taken(speed, VELOCITY, LARGEST_INPUT)
+        self._speeds.update(stamp_ns, taken)
+        self._delays.update(stamp_ns, delay_ns)
+        if self._speeds.holding or self._delays.holding:
+            self._held_speed = True
+        else:
+            self._waiting.append(_Speed(stamp_ns, taken, delay_ns))
 
     def imu(
         self,
@@ -219,8 +247,10 @@ class FixedLuenbergerObserver:
             )
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"imu: stamp {stamp_ns} ns is not after the one before, {self._last_ns} ns")
+        unit, orientation = self._orientations.update(stamp_ns, (unit, orientation))
         x, y, z = rotated(unit, self._taken_vector(body))
-        measured = (x, y, z if linear_accel is not None else z - GRAVITY_FIXED)
+        measured = self._accelerations.update(stamp_ns, (x, y, z if linear_accel is not None else z - GRAVITY_FIXED))
+        self._note_held("accel" if linear_accel is None else "linear_accel")
         if self._last_ns is not None:
             self._advance(stamp_ns, stamp_ns - self._last_ns)
         self._last_ns = stamp_ns
@@ -229,6 +259,15 @@ class FixedLuenbergerObserver:
         self.saturated, self._flagged = self._flagged, False
         position, velocity = _floats(self._position, POSITION), _floats(self._velocity, VELOCITY)
         return PoseEstimate(position, velocity, orientation, None)
+
+    def _note_held(self, acceleration: str) -> None:
+        held = (
+            (self._orientations.holding, "orientation"),
+            (self._accelerations.holding, acceleration),
+            (self._held_speed, "speed"),
+        )
+        self.held = tuple(name for is_held, name in held if is_held)
+        self._held_speed = False
 
     def _advance(self, stamp_ns: int, interval_ns: int) -> None:
         is_gap = interval_ns > LONGEST_INTERVAL_NS
@@ -319,6 +358,20 @@ def _unit(orientation: Quaternion) -> tuple[int, int, int, int]:
     if abs(w * w + x * x + y * y + z * z - (1 << 2 * UNIT)) > UNIT_TOLERANCE:
         raise ValueError(f"{METHOD}: orientation {orientation} is no rotation; its norm is not 1")
     return w, x, y, z
+
+
+def _unlikeness(a: _Attitude, b: _Attitude) -> int:
+    """The less, the smaller the turn from one attitude to the other: less the cosine of half of it, Q3.60."""
+    return -abs(sum(one * other for one, other in zip(a[0], b[0], strict=True)))
+
+
+def _apart(a: Integers, b: Integers) -> int:
+    """The square of the distance."""
+    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+
+
+def _difference(a: int, b: int) -> int:
+    return abs(a - b)
 
 
 def _floats(values: Integers, fraction: int) -> Vector:
