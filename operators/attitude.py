@@ -2,6 +2,9 @@
 
 in   imu : Imu   gyro, accelerometer and, where there is one, magnetometer
 out  imu : Imu   the same sample with `orientation` and `linear_accel` filled in
+
+Single wild readings do not reach the filter, and `linear_accel` follows from what was taken in their place. `gyro`,
+`accel` and `mag` go out as they came: what a sensor said stays on record, and every estimator has a gate of its own.
 """
 
 import math
@@ -12,6 +15,8 @@ import msgspec
 from annotated_types import Ge, Le
 
 from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
+from caneflow.algorithms.gated_attitude import GatedAttitude
+from caneflow.algorithms.glitches import GlitchSettings
 from caneflow.algorithms.initial_attitude import NORTH_YAW, AttitudeMethod
 from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, from_yaw, multiply, normalized, rotate
@@ -32,6 +37,7 @@ class AttitudeSettings:
     magnetic_north: Annotated[float, Ge(-2.0 * math.pi), Le(2.0 * math.pi)] = NORTH_YAW  # rad, its yaw in R0
     attitude_filter: AttitudeFilterSettings = field(default_factory=AttitudeFilterSettings)
     madgwick: MadgwickSettings = field(default_factory=MadgwickSettings)
+    glitches: GlitchSettings = field(default_factory=GlitchSettings)  # its `rotation` is not used here
 
 
 class Attitude(Operator):
@@ -42,7 +48,7 @@ class Attitude(Operator):
     Settings = AttitudeSettings
 
     def __init__(self, settings: AttitudeSettings, context: Context) -> None:
-        self._filter = attitude_method(settings)
+        self._filter = GatedAttitude(attitude_method(settings), settings.glitches, settings.method)
         self._uses_magnetometer = settings.magnetometer
         self._to_rig = from_yaw(settings.magnetic_north - NORTH_YAW) if settings.magnetometer else from_yaw(0.0)
 
@@ -51,11 +57,11 @@ class Attitude(Operator):
         assert isinstance(message, Imu)
         mag = message.mag if self._uses_magnetometer else None
         try:
-            estimate = self._filter.update(message.stamp, message.gyro, message.accel, mag)
+            estimate, accel = self._filter.update(message.stamp, message.gyro, message.accel, mag)
         except ValueError as error:
             raise Refused(str(error)) from error
         orientation = normalized(multiply(self._to_rig, estimate.orientation))
-        linear = linear_acceleration(orientation, message.accel)
+        linear = linear_acceleration(orientation, accel)
         yield "imu", msgspec.structs.replace(message, orientation=orientation, linear_accel=linear)
 
 

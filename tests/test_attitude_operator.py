@@ -2,9 +2,11 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
+from caneflow.algorithms.glitches import GlitchSettings
 from caneflow.algorithms.rotations import Vector, conjugate, from_rotation_vector, from_yaw, multiply, rotate
 from caneflow.messages import Imu, decode, numbered
 from caneflow.messages.rig import Rig
@@ -75,6 +77,31 @@ def test_an_orientation_of_the_chip_is_replaced() -> None:
     assert isinstance(out, Imu)
     assert out.orientation == pytest.approx(from_rotation_vector((0.3, -0.2, 0.7)), abs=1e-3)
     assert out.linear_accel == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_wild_sample_changes_neither_attitude_nor_linear_acceleration(method: Method) -> None:
+    attitude = operator(method=method)
+    for k in range(60):
+        sample = still(k)
+        if k == 50:
+            sample = msgspec.structs.replace(sample, gyro=(0, 90, 0), accel=(0.0, -4000.0, 0.0), mag=(9e3, 0.0, 0.0))
+        ((_, out),) = attitude.handle("imu", sample)
+        assert isinstance(out, Imu)
+        assert out.orientation == pytest.approx(from_rotation_vector((0.3, -0.2, 0.7)), abs=1e-3)
+        assert out.linear_accel == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
+        assert (out.gyro, out.accel, out.mag) == (sample.gyro, sample.accel, sample.mag), "as the sensor said"
+
+
+def test_how_much_is_wild_can_be_said() -> None:
+    attitude = operator(glitches=GlitchSettings(acceleration=1e4))
+    for k in range(60):
+        ((_, out),) = attitude.handle(
+            "imu", msgspec.structs.replace(still(k), accel=(0.0, 0.0, 9.8 + 50.0 * (k == 50)))
+        )
+        assert isinstance(out, Imu)
+        assert out.linear_accel is not None
+        assert out.linear_accel[2] == pytest.approx(50.0 * (k == 50), abs=0.1)
 
 
 def test_a_sample_that_cannot_be_used_is_refused_and_the_next_one_goes_on() -> None:

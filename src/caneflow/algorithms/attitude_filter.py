@@ -13,8 +13,10 @@ filters here are others: two first-order low passes (so that any interval will d
 World: x east, y magnetic north, z up.
 """
 
+import math
 from dataclasses import dataclass, field
 
+from caneflow.algorithms.attitude_recovery import FIELD_ERROR, SMALLEST, Holes, Recovery
 from caneflow.algorithms.dead_reckoning import LONGEST_INTERVAL, SampleClock
 from caneflow.algorithms.gyro_bias import (
     NOTHING_SEEN,
@@ -64,6 +66,8 @@ class AttitudeFilter:
         self._since_accel = self._since_field = 0.0  # s since the last reading of each
         self._rest = RestDetector(settings.bias)
         self._bias = GyroBias(settings.bias)
+        self._holes = Holes()
+        self._recovery: Recovery | None = None  # since the last hole
 
     @property
     def gaps(self) -> int:
@@ -92,8 +96,12 @@ class AttitudeFilter:
         """
         attitude, interval = self._predicted(stamp_ns, gyro, accel)
         self._gyro = gyro
-        self._attitude = self._corrected(attitude, gyro, accel, mag, interval)
-        return AttitudeEstimate(self._with_yaw(self._attitude), self._bias.bias)
+        if self._recovery is None:
+            self._attitude = self._corrected(attitude, gyro, accel, mag, interval)
+            return AttitudeEstimate(self._with_yaw(self._attitude), self._bias.bias)
+        self._attitude = attitude
+        found = self._found(self._recovery, attitude, gyro, accel, mag, interval)
+        return AttitudeEstimate(self._with_yaw(found), self._bias.bias)
 
     def _predicted(self, stamp_ns: int, gyro: Vector, accel: Vector | None) -> tuple[Quaternion, float]:
         """The attitude by the gyro alone, and the s over which it was integrated."""
@@ -103,8 +111,13 @@ class AttitudeFilter:
             return start, 0.0
         interval = self._clock.interval(stamp_ns)
         assert interval is not None  # the clock has had its first stamp
+        spread = self._holes.spread(interval, gyro, accel)
         if interval > LONGEST_INTERVAL:
-            return self._after_gap(self._attitude, accel), 0.0
+            self._begin_recovery(spread or math.inf)
+            return self._attitude, 0.0
+        if spread > SMALLEST or (spread > 0.0 and self._recovery is not None):
+            self._begin_recovery(spread)
+            return self._turned(self._attitude, gyro, interval), 0.0
         return self._turned(self._attitude, gyro, interval), interval
 
     def _turned(self, attitude: Quaternion, gyro: Vector, interval: float) -> Quaternion:
@@ -119,14 +132,47 @@ class AttitudeFilter:
         )
         return normalized(multiply(attitude, from_rotation_vector(turn)))
 
-    def _after_gap(self, attitude: Quaternion, accel: Vector | None) -> Quaternion:
-        """Level by this reading, as at the start; the next magnetometer reading says yaw anew."""
-        self._gravity.restart()
+    def _begin_recovery(self, spread: float) -> None:
+        """What the turn rate may have done in a hole; what was not yet found of the one before adds to it."""
+        if self._recovery is not None:
+            spread = math.hypot(spread, self._recovery.spread)
+            self._end_recovery()
         self._rest.restart()
-        self._heading.forget()
-        if accel is None or not self._gravity.usable(accel):
-            return attitude
-        return multiply(level(rotate(attitude, accel)), attitude)
+        self._recovery = Recovery(spread, self._holes.speed, self._heading.undisturbed())
+        self._heading.open(spread / FIELD_ERROR)
+
+    def _found(
+        self,
+        recovery: Recovery,
+        attitude: Quaternion,
+        gyro: Vector,
+        accel: Vector | None,
+        mag: Vector | None,
+        interval: float,
+    ) -> Quaternion:
+        """The attitude with what was found of the turn in the hole."""
+        recovery.update(attitude, accel, mag, interval)
+        found = normalized(multiply(recovery.turn, attitude))
+        self._since_field += interval
+        if mag is not None:
+            if not recovery.has_field:
+                row = vertical_row(found, self._bias.bias)
+                self._heading.update(rotate(found, mag), row, gyro, self._since_field, levelled=False)
+            self._since_field = 0.0
+        if recovery.over:
+            self._end_recovery()
+        return found
+
+    def _end_recovery(self) -> None:
+        """The filters of the steady state go on from the rotation that was found."""
+        assert self._recovery is not None
+        assert self._attitude is not None
+        self._attitude = normalized(multiply(self._recovery.turn, self._attitude))
+        self._gravity.restart(self._recovery.force, self._recovery.elapsed)
+        if self._recovery.has_field:
+            self._heading.averaged(self._recovery.elapsed)
+        self._since_accel = self._since_field = 0.0
+        self._recovery = None
 
     def _corrected(
         self, attitude: Quaternion, gyro: Vector, accel: Vector | None, mag: Vector | None, interval: float
@@ -176,12 +222,12 @@ class _Gravity:
         self._time_constant = time_constant  # s, of each
         self.restart()
 
-    def restart(self) -> None:
-        """Take the next force as it is; from there the mean, until the low passes have had their time."""
-        self._once: Vector | None = None
-        self._twice: Vector = (0.0, 0.0, 0.0)
+    def restart(self, force: Vector | None = None, elapsed: float = 0.0) -> None:
+        """Take `force`, a mean over `elapsed` s, or the next as it is; from there the mean, while that is younger."""
+        self._once: Vector | None = force
+        self._twice: Vector = force or (0.0, 0.0, 0.0)
         self._rows_once = self.rows = (NOTHING_SEEN, NOTHING_SEEN)
-        self._elapsed = 0.0  # s
+        self._elapsed = elapsed  # s
 
     @property
     def levelled(self) -> bool:

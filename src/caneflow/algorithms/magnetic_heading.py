@@ -8,6 +8,7 @@ longer the longer the field was not believed. A disturbed field has `distrust` t
 import math
 from dataclasses import dataclass, field
 
+from caneflow.algorithms.attitude_recovery import LEAST_LEVEL, UndisturbedField
 from caneflow.algorithms.gyro_bias import NOTHING_SEEN, Row, followed_row
 from caneflow.algorithms.initial_attitude import NORTH_YAW
 from caneflow.algorithms.quantities import Angle, Factor, Time
@@ -19,7 +20,6 @@ LARGEST_DISTRUST = 1000.0
 FAR = 10.0  # deviations; one that is further is distrusted no more, and its fourth power may be no number
 SETTLED = 1.5  # times the steady variance, below which corrections are of now, not of what was
 LEVELLING_MEMORY = 1.0  # s of readings that count before the attitude is level
-LEAST_LEVEL = 1e-3  # of the field's strength; a field as steep as that has no yaw
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +118,25 @@ class MagneticHeading:
         """Take the next reading's yaw as it is."""
         self._variance = math.inf  # s, see above
         self.row: Row = NOTHING_SEEN  # what the corrections tell of the gyro's bias
+
+    def open(self, times: float) -> None:
+        """Yaw may be off by `times` the error of a reading that stands for 1 s."""
+        self._variance += (times * self._settings.time_constant) ** 2
+
+    def averaged(self, elapsed: float) -> None:
+        """`elapsed` s of readings have been averaged elsewhere."""
+        self._variance = 1.0 / (1.0 / self._variance + elapsed / self._settings.time_constant**2)
+
+    def undisturbed(self) -> UndisturbedField | None:
+        """The field as it was before the last reading, in the gyro's world; None where it cannot be trusted."""
+        shape = self._reference.shape
+        if shape is None or self.disturbed or math.isinf(self._variance):
+            return None
+        level, yaw = math.cos(shape.dip), NORTH_YAW - self.offset
+        direction = level * math.cos(yaw), level * math.sin(yaw), -math.sin(shape.dip)
+        return UndisturbedField(
+            direction=direction, strength=shape.strength, tolerance=self._settings.strength_tolerance
+        )
 
     def update(
         self, magnetic: Vector, row: Row, gyro: Vector, interval: float, *, levelled: bool = True
