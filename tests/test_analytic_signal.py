@@ -63,3 +63,24 @@ def test_frequencies_are_those_of_the_samples() -> None:
 def test_a_pulse_that_the_samples_cannot_hold_is_refused(step: float, carrier: float) -> None:
     with pytest.raises(ValueError, match=r"does not show in 96 samples every"):
         AnalyticSignal(bins=96, range_step=step, carrier=carrier, bandwidth=1e9)
+
+
+def test_with_soft_ends_a_strong_echo_does_not_ring() -> None:
+    """Half a metre off the sharp band rings at -35 dB or more; softened it is 30 dB below that."""
+    bins = 288
+    offset = STEP * (np.arange(bins) - 60)
+    scan = np.exp(-0.5 * (offset / 0.02) ** 2) * np.cos(4 * math.pi * CARRIER / SPEED_OF_LIGHT * offset)
+    signal = AnalyticSignal(bins=bins, range_step=STEP, carrier=CARRIER, bandwidth=BANDWIDTH)
+    sharp = signal(scan[None].astype(np.float32))[0]
+    soft = signal.softened(sharp)
+    far = slice(115, 230)
+    ringing = 20 * np.log10(np.abs(sharp[far]).max() / np.abs(sharp).max())
+    softened = 20 * np.log10(np.abs(soft[far]).max() / np.abs(soft).max())
+    assert ringing > -45
+    assert softened < ringing - 20
+    assert 0.3 < np.abs(soft).max() / np.abs(sharp).max() < 0.8
+
+
+def test_a_scan_that_no_gateway_holds_is_refused() -> None:
+    with pytest.raises(ValueError, match="is too long"):
+        AnalyticSignal(bins=200_000, range_step=STEP, carrier=CARRIER, bandwidth=BANDWIDTH)

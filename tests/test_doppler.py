@@ -241,12 +241,13 @@ def test_a_block_that_says_another_rate_or_carrier_once_is_taken_for_one_of_the_
     assert (given, refused, window.gaps) == (20 - 5, [], 0)
 
 
-def test_a_block_whose_samples_are_of_another_rate_too_is_refused_and_believed_when_it_lasts() -> None:
-    makes = [(RATE, CARRIER, BLOCK)] * 10 + [(2 * RATE, CARRIER, 2 * BLOCK)] * 12
-    given, refused, _ = fed(*makes)
-    assert len(refused) == 3
-    assert "I and Q at 8000 Hz, carrier 2.4125e+10 Hz among blocks of I and Q at 4000 Hz" in refused[0]
-    assert given == (10 - 5) + (9 - 5)
+def test_a_block_whose_samples_are_of_another_rate_too_counts_as_lost_and_is_believed_when_it_lasts() -> None:
+    once = [(RATE, CARRIER, BLOCK)] * 10 + [(2 * RATE, CARRIER, 2 * BLOCK)] + [(RATE, CARRIER, BLOCK)] * 9
+    given, refused, window = fed(*once)
+    assert (given, refused, window.gaps) == ((10 - 5) + (9 - 5), [], 1)
+    lasting = [(RATE, CARRIER, BLOCK)] * 10 + [(2 * RATE, CARRIER, 2 * BLOCK)] * 12
+    given, refused, _ = fed(*lasting)
+    assert (given, refused) == ((10 - 5) + (12 - 3 - 5), [])
 
 
 def test_a_rate_that_no_window_can_hold_is_refused_for_as_long_as_it_lasts() -> None:

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from caneflow.algorithms.attitude_history import AttitudeHistory
+from caneflow.algorithms.background import Background
 from caneflow.algorithms.footprint import CaneGeometry
 from caneflow.algorithms.ground_velocity import (
     UNOBSERVED,
@@ -15,7 +16,7 @@ from caneflow.algorithms.ground_velocity import (
     VelocityEstimate,
     beam_factor,
 )
-from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
+from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters, StandingPicture
 from caneflow.algorithms.rotations import Quaternion, from_rotation_vector
 from caneflow.physics import SPEED_OF_LIGHT
 
@@ -30,14 +31,24 @@ BINS = 288
 RANGES = PARAMETERS.range_start + PARAMETERS.range_step * np.arange(BINS)
 
 
-def returns_of(scan: Scans, index: int) -> MovingReturns:
+def returns_of(scan: Scans, index: int, background: Background) -> MovingReturns:
+    """As a filter whose background is `background` makes them of what moves, `scan`."""
     return MovingReturns(
         scans=scan[None],
         stamps_ns=(START_NS + index * PERIOD_NS,),
-        lost=0,
+        stand_ins=(),
         parameters=PARAMETERS,
         restarted=index == 0,
+        standing=StandingPicture(background, None),
     )
+
+
+def standing(picture: Scans) -> Background:
+    """A background in which `picture` has stood for a second."""
+    background = Background(0.5)
+    for _ in range(100):
+        background.remove(picture.copy(), 0.01)
+    return background
 
 
 def ground(forward: float, *, scans: int, noise: float = 0.0, height: float = HEIGHT, up: float = 0.0) -> Scans:
@@ -55,9 +66,19 @@ def ground(forward: float, *, scans: int, noise: float = 0.0, height: float = HE
 
 
 def run(
-    scans: Scans, *, settings: GroundVelocitySettings | None = None, turn_rate: float = 0.0, rise: float | None = None
+    scans: Scans,
+    *,
+    settings: GroundVelocitySettings | None = None,
+    turn_rate: float = 0.0,
+    rise: float | None = None,
+    stands: float = 0.0,
 ) -> tuple[GroundVelocityEstimator, list[VelocityEstimate]]:
-    """Estimates for each of `scans`; with `rise` an accelerometer that saw the start of a lift at that speed."""
+    """Estimates for each of `scans`; with `rise` an accelerometer that saw the start of a lift at that speed.
+
+    `stands`: rms amplitude of the ground in the background.
+    """
+    speckle = np.random.default_rng(7).normal(size=(2, BINS)) / math.sqrt(2.0)
+    background = standing((stands * (speckle[0] + 1j * speckle[1])).astype(np.complex64))
     estimator = GroundVelocityEstimator(settings or GroundVelocitySettings(every=1), GEOMETRY)
     attitudes = AttitudeHistory()
     estimates = []
@@ -68,7 +89,7 @@ def run(
             jolt = rise / 0.01 if index == 1 else 0.0
             up = 9.80665 + jolt
             estimator.imu(stamp_ns, HELD, (0.0, -up * math.sin(PITCH), up * math.cos(PITCH)))
-        estimate = estimator.update(returns_of(scan, index), attitudes)
+        estimate = estimator.update(returns_of(scan, index, background), attitudes)
         if estimate is not None:
             estimates.append(estimate)
     return estimator, estimates
@@ -103,15 +124,33 @@ def test_a_wall_that_fills_a_fifth_of_the_ranges_costs_little() -> None:
     assert estimates[-1].velocity[0] == pytest.approx(0.45, abs=0.03)
 
 
-def test_noise_alone_is_rest_for_a_still_cane_and_nothing_for_a_turning_one() -> None:
+def noise(scans: int = 60) -> Scans:
     rng = np.random.default_rng(2)
-    noise = (rng.normal(size=(60, BINS)) + 1j * rng.normal(size=(60, BINS))).astype(np.complex64)
-    _, still = run(noise)
-    resting = [e for e in still if e.valid and e.covariance[2] < UNOBSERVED]
-    assert len(resting) > 40
-    assert all(e.velocity == (0.0, 0.0) for e in resting)
-    _, turning = run(noise, turn_rate=1.0)
+    made: Scans = (rng.normal(size=(scans, BINS)) + 1j * rng.normal(size=(scans, BINS))).astype(np.complex64)
+    return made
+
+
+@pytest.mark.parametrize("stands", [1.0, 10.0])
+def test_ground_that_stands_is_rest_for_a_still_cane_and_nothing_for_a_turning_one(stands: float) -> None:
+    """In noise of power 2: at -3 and at 17 dB."""
+    _, still = run(noise(), stands=stands)
+    resting = [e for e in still if e.valid]
+    assert len(resting) == 55
+    assert all((e.velocity, e.covariance) == ((0.0, 0.0), (0.03**2, 0.0, 0.03**2)) for e in resting)
+    _, turning = run(noise(), turn_rate=1.0, stands=stands)
     assert not any(e.valid and e.covariance[2] < UNOBSERVED for e in turning)
+
+
+@pytest.mark.parametrize("stands", [0.0, 0.1])
+def test_noise_alone_is_no_rest(stands: float) -> None:
+    """Nothing is seen: no velocity, and no rest."""
+    _, still = run(noise(), stands=stands)
+    assert {(e.velocity, e.covariance, e.valid) for e in still} == {((0.0, 0.0), (UNOBSERVED, 0.0, UNOBSERVED), False)}
+
+
+def test_a_radar_without_any_noise_is_none() -> None:
+    _, still = run(np.zeros((60, BINS), np.complex64), stands=10.0)
+    assert not any(e.valid for e in still)
 
 
 def test_refuses_what_is_near_the_limit_of_unambiguous_doppler() -> None:
@@ -138,7 +177,9 @@ def test_learns_that_the_hand_is_lower_than_the_rig_says() -> None:
 def test_without_an_attitude_there_is_nothing() -> None:
     estimator = GroundVelocityEstimator(GroundVelocitySettings(every=1), GEOMETRY)
     scans = ground(0.45, scans=8)
-    estimates = [estimator.update(returns_of(scan, i), AttitudeHistory()) for i, scan in enumerate(scans)]
+    estimates = [
+        estimator.update(returns_of(scan, i, standing(scan)), AttitudeHistory()) for i, scan in enumerate(scans)
+    ]
     assert not any(estimate is None or estimate.valid for estimate in estimates)
 
 
@@ -150,7 +191,7 @@ def test_an_estimate_every_few_frames_is_the_one_of_every_frame(every: int) -> N
     attitudes = AttitudeHistory()
     for index, scan in enumerate(scans):
         attitudes.add(START_NS + index * PERIOD_NS, HELD, (0.0, 0.0, 0.0))
-        estimate = estimator.update(returns_of(scan, index), attitudes)
+        estimate = estimator.update(returns_of(scan, index, standing(scan)), attitudes)
         assert (estimate is not None) == ((index + 1) % every == 0)
         if estimate is not None and estimate.valid:
             # the height's error has been learnt from fewer frames

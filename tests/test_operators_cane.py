@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from caneflow.algorithms.rotations import rotate
 from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, RadarFrame, Sample
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.runtime import Context, Operator, Refused
-from caneflow.simulation.scenario import Walk, simulate_walk
+from caneflow.simulation.scenario import Walk, simulate_walk, walk_settings
 from operators.fusion import Fusion, FusionSettings
 from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings
 
@@ -32,6 +34,7 @@ def samples() -> Iterator[tuple[str, Sample]]:
 
 
 def samples_of(made: Walk) -> Iterator[tuple[str, Sample]]:
+    """Frames and IMU readings of a walk, in event time."""
     imu = made.imu
     for i, stamp in enumerate(made.stamps_ns.tolist()):
         yield (
@@ -96,6 +99,81 @@ def test_each_front_end_can_be_switched_off() -> None:
     assert sum(speed.velocity is not None for speed in alone) == 1, "every fifth"
     with pytest.raises(ValueError, match="nothing to say"):
         GroundSpeedSettings(with_speed=False, with_velocity=False)
+
+
+def told(scans: np.ndarray) -> list[GroundSpeed]:
+    """Of the walk's IMU and other scans, 3 s at rest; after 0.7 s, when the window is full."""
+    operator = GroundSpeedOperator(GroundSpeedSettings(), context(read_rig(walk().rig)))
+    frames, out = iter(scans), []
+    for port, message in samples():
+        if port == "frame" and (scan := next(frames, None)) is None:
+            break
+        if isinstance(message, RadarFrame) and scan is not None:
+            message = msgspec.structs.replace(message, scans=scan[None])
+        out += [sample for _, sample in operator.handle(port, message) if isinstance(sample, GroundSpeed)]
+    return out[70:]
+
+
+def at_rest(snr: float) -> np.ndarray:
+    """Scans of the walk's first 1.9 s at another SNR (dB)."""
+    settings = walk_settings("straight", 3)
+    settings = replace(settings, radar=replace(settings.radar, snr=snr))
+    return simulate_walk(settings, seed=3, duration=1.9).scans
+
+
+@pytest.mark.parametrize("snr", [15.0, 0.0])
+def test_rest_is_claimed_where_the_ground_is_seen(snr: float) -> None:
+    found = told(at_rest(snr))
+    assert all(one.valid and one.quality == 0.0 for one in found)
+    assert all(one.velocity_cov[0] < 0.1 for one in found if one.velocity_cov)
+
+
+BLIND: dict[str, np.ndarray | float] = {
+    "noise": np.random.default_rng(1).normal(0.0, 200.0, (190, 288)),
+    "noise of one bit": np.random.default_rng(1).integers(0, 2, (190, 288)),
+    "faint ground": -15.0,
+    "zeros": np.zeros((190, 288)),
+    "a constant": np.full((190, 288), 77.0),
+}
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32, np.complex64])
+@pytest.mark.parametrize("seen", BLIND)
+def test_where_the_radar_sees_nothing_nobody_stands(seen: str, dtype: type) -> None:
+    made = BLIND[seen]
+    scans = at_rest(made) if isinstance(made, float) else made
+    assert_nothing(told(scans.astype(dtype)))
+
+
+def test_a_radar_that_hangs_sees_nothing() -> None:
+    assert_nothing(told(np.repeat(at_rest(15.0)[:1], 190, axis=0)))
+
+
+def assert_nothing(found: list[GroundSpeed]) -> None:
+    assert {(one.speed, one.quality, one.valid) for one in found} == {(0.0, math.inf, False)}
+    assert {(one.velocity, one.velocity_cov) for one in found} == {(None, None), ((0.0, 0.0), (1e6, 0.0, 1e6))}
+
+
+def test_a_steady_walk_in_noise_is_never_taken_for_rest() -> None:
+    """1 m/s without swing: from 15 dB, where all is seen, to -10, where nothing is."""
+    settings = walk_settings("straight", 3)
+    motion = replace(settings.motion, speed=1.0, swing=0.0, wander=math.radians(0.5))
+    for snr, least, most in ((15.0, 0.95, 1.0), (-6.0, 0.05, 0.9), (-10.0, 0.0, 0.05)):
+        radar = replace(settings.radar, snr=snr)
+        made = simulate_walk(replace(settings, motion=motion, radar=radar), seed=3, duration=6.0)
+        found = steady(made)
+        valid = [one for one in found if one.valid]
+        assert least <= len(valid) / len(found) <= most
+        assert all(one.speed > 0.5 for one in valid)
+        seen = [one.velocity[0] for one in found if one.velocity and one.velocity_cov and one.velocity_cov[0] < 1e5]
+        assert all(speed > 0.5 for speed in seen)
+
+
+def steady(made: Walk) -> list[GroundSpeed]:
+    """The speeds of its last 2 s."""
+    operator = GroundSpeedOperator(GroundSpeedSettings(), context(read_rig(made.rig)))
+    out = [sample for sample in through(operator, samples_of(made)) if isinstance(sample, GroundSpeed)]
+    return out[-200:]
 
 
 def test_what_the_rig_lacks_is_named() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caneflow.algorithms.range_doppler import hann, range_doppler_map
-from caneflow.algorithms.rest import RestSettings, is_at_rest, peaks_and_floor
+from caneflow.algorithms.rest import RestSettings, ground_stands, is_at_rest, peaks_and_floor
 
 SETTINGS = RestSettings()
 STILL = 0.01  # rad/s
@@ -36,7 +36,7 @@ def ground(rng: np.random.Generator, speed: float, snr_db: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sd", [1e-2, 1.0, 1e4])
-def test_noise_of_any_strength_is_rest(sd: float) -> None:
+def test_in_noise_of_any_strength_nothing_moves(sd: float) -> None:
     rng = np.random.default_rng(11)
     ratios = []
     for _ in range(300):
@@ -83,3 +83,28 @@ def test_turning_is_no_rest_and_the_gate_can_be_left_open() -> None:
     assert is_at_rest(2.0, 1.0, math.radians(2), SETTINGS), "a gyro's bias"
     assert not is_at_rest(2.0, 1.0, math.radians(8), SETTINGS)
     assert not is_at_rest(2.0, 1.0, STILL, RestSettings(enabled=False))
+
+
+def test_ground_stands_where_half_of_the_cells_show_it() -> None:
+    tip, ground = np.zeros(16), np.zeros(16)
+    tip[7:10] = 1e6  # the cane's own
+    ground[::2] = ground[1] = 0.2
+    assert not ground_stands(tip, 1.0, 0.01, 0.05)
+    assert ground_stands(ground, 1.0, 0.01, 0.05)
+    assert not ground_stands(ground, 10.0, 0.01, 0.05), "what is left of a scan hides it"
+    assert not ground_stands(ground, 1.0, 0.1, 0.05), "a mean over few scans has noise of its own"
+
+
+def test_without_any_noise_there_is_no_radar() -> None:
+    assert not ground_stands(np.ones(16), 0.0, 0.01, 0.05)
+    assert not ground_stands(np.zeros(16), 0.0, 0.01, 0.05)
+
+
+def test_noise_alone_hardly_ever_passes_for_ground_that_stands() -> None:
+    """The mean over 0.5 s at 100 Hz has a hundredth of the noise; cells are neighbours, two independent in three."""
+    rng = np.random.default_rng(14)
+    taken = 0
+    for _ in range(2000):
+        picture = np.repeat(0.01 * rng.exponential(size=6), 3)
+        taken += ground_stands(picture, 1.0, 0.01, SETTINGS.least_standing)
+    assert taken == 0

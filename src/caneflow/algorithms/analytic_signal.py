@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from caneflow.physics import SPEED_OF_LIGHT
 
+LARGEST_FILTER = 1 << 21  # lines times samples, 50 MB: 3000 samples of a P440
+
 
 def fast_time_frequencies(bins: int, range_step: float) -> NDArray[np.float64]:
     """Frequency (Hz) of each line of the one-sided fast-time spectrum of `bins` samples; shape (bins // 2 + 1,).
@@ -18,6 +20,27 @@ def fast_time_frequencies(bins: int, range_step: float) -> NDArray[np.float64]:
     `range_step` is the spacing of the samples in metres of range.
     """
     return np.arange(bins // 2 + 1, dtype=np.float64) * (SPEED_OF_LIGHT / (2 * range_step * bins))
+
+
+def require_band(bins: int, range_step: float, carrier: float, bandwidth: float) -> NDArray[np.bool_]:
+    """Which lines of the fast-time spectrum, (bins // 2 + 1,), are in the pulse's band.
+
+    Raises:
+        ValueError: none is, or there are so many that a filter for them is more than a gateway can hold.
+    """
+    frequencies = fast_time_frequencies(bins, range_step)
+    inside = np.abs(frequencies - carrier) <= bandwidth / 2
+    if not inside.any() or carrier >= frequencies[-1]:
+        raise ValueError(
+            f"a pulse at {carrier:.4g} Hz, {bandwidth:.3g} Hz wide, does not show in {bins} samples "
+            f"every {range_step:.4g} m: they hold 0..{frequencies[-1]:.4g} Hz"
+        )
+    if (count := int(np.count_nonzero(inside))) * bins > LARGEST_FILTER:
+        raise ValueError(
+            f"a scan of {bins} samples, with {count} lines in the pulse's band, is too long: "
+            f"expected at most {LARGEST_FILTER} as their product"
+        )
+    return inside
 
 
 class AnalyticSignal:
@@ -29,15 +52,13 @@ class AnalyticSignal:
         Raises:
             ValueError: the pulse's band lies outside of what the samples can hold.
         """
-        frequencies = fast_time_frequencies(bins, range_step)
-        inside = np.abs(frequencies - carrier) <= bandwidth / 2
-        if not inside.any() or carrier >= frequencies[-1]:
-            raise ValueError(
-                f"a pulse at {carrier:.4g} Hz, {bandwidth:.3g} Hz wide, does not show in {bins} samples "
-                f"every {range_step:.4g} m: they hold 0..{frequencies[-1]:.4g} Hz"
-            )
+        inside = require_band(bins, range_step, carrier, bandwidth)
+        # From 0 over 1 in the band's middle to 0: what `softened` multiplies the spectrum with.
+        lines = np.flatnonzero(inside)
+        self._taper = np.zeros(bins, dtype=np.float32)
+        self._taper[lines] = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(len(lines)) + 0.5) / len(lines))
         # The band has a tenth of a scan's lines: two small products cost less than two transforms of all of them.
-        turns = np.outer(np.flatnonzero(inside), np.arange(bins)) % bins * (2 * np.pi / bins)  # rad, lines x samples
+        turns = np.outer(lines, np.arange(bins)) % bins * (2 * np.pi / bins)  # rad, lines x samples
         cosines, sines = np.cos(turns), np.sin(turns)
         # each line's real and imaginary part out of a scan, and what those parts add to each sample's parts
         self._to_lines = (np.stack([cosines, -sines]) * (2 / bins)).reshape(-1, bins).astype(np.float32)
@@ -49,6 +70,14 @@ class AnalyticSignal:
         lines = np.einsum("...k,jk->...j", scans.astype(np.float32), self._to_lines)
         parts: NDArray[np.float32] = np.einsum("...j,jk->...k", lines, self._from_lines)
         return parts.view(np.complex64)
+
+    def softened(self, scan: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """One analytic `scan`, shape (bins,), of half the resolution, in which strong echoes do not ring.
+
+        The band's sharp ends make each echo ring on over all ranges: at a metre by -40 dB, which for direct coupling is
+        as much as ground has. With soft ends it falls by 18 dB an octave.
+        """
+        return np.fft.ifft(np.fft.fft(scan) * self._taper).astype(np.complex64)
 
 
 def _parts_in_turn(values: NDArray[np.complex128]) -> NDArray[np.float32]:

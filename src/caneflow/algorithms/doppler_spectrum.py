@@ -99,21 +99,27 @@ class SlidingSpectrum:
             carrier: Hz.
 
         A block of another make than the ones before, for three blocks in a row at most, is one by mistake: where its
-        stamp fits its samples at the rate before, it is taken for one of that make.
+        stamp fits its samples at the rate before, it is taken for one of that make, otherwise it counts as lost.
 
         Raises:
-            ValueError: a block that is not newer than the one before, a band that the sample rate cannot hold, or
-                samples of another make; nothing has changed then but what is known of makes.
+            ValueError: a block that is not newer than the one before, or a rate that cannot hold the band or takes too
+                long a window; nothing has changed then.
         """
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"block at {stamp_ns} ns is not newer than the last, {self._last_ns} ns")
         make = (sample_rate, carrier, samples.dtype.kind == "c")
-        before_ns, self._seen_ns = self._seen_ns, stamp_ns
-        believed = self._makes.update(stamp_ns, make)
-        if believed != make and not _fits(believed, samples, stamp_ns - (before_ns or 0)):
-            raise ValueError(f"a block of {_named(make)} among blocks of {_named(believed)}")
+        elapsed_ns = stamp_ns - (self._seen_ns or 0)
+        impossible = self._impossible(sample_rate)
+        if not impossible:
+            believed = self._makes.update(stamp_ns, make)
+        elif self._make is not None and _fits(self._make, samples, elapsed_ns):
+            believed = self._make
+        else:
+            raise ValueError(impossible)
+        self._seen_ns = stamp_ns
+        if believed != make and not _fits(believed, samples, elapsed_ns):
+            return None
         if believed != self._make:
-            self._check(believed[0])
             self._prepare(believed)
         self._forget_over_gap(stamp_ns, len(samples))
         self._last_ns = stamp_ns
@@ -122,14 +128,14 @@ class SlidingSpectrum:
         self._since_hop %= self._hop
         return self._spectrum() if due and self._filled == len(self._kept) else None
 
-    def _check(self, sample_rate: float) -> None:
+    def _impossible(self, sample_rate: float) -> str:
+        """What is wrong with a rate; empty when nothing is."""
         settings = self._settings
         if 2.0 * settings.highest > sample_rate:
-            raise ValueError(f"a band up to {settings.highest:g} Hz takes more than {sample_rate:g} samples a second")
+            return f"a band up to {settings.highest:g} Hz takes more than {sample_rate:g} samples a second"
         if settings.window * sample_rate > LARGEST_WINDOW:
-            raise ValueError(
-                f"a window of {settings.window:g} s at {sample_rate:g} Hz has more than {LARGEST_WINDOW} samples"
-            )
+            return f"a window of {settings.window:g} s at {sample_rate:g} Hz has more than {LARGEST_WINDOW} samples"
+        return ""
 
     def _prepare(self, make: Make) -> None:
         settings = self._settings
@@ -283,8 +289,3 @@ def _fits(make: Make, samples: NDArray[np.number], elapsed_ns: int) -> bool:
     sample_rate, _, signed = make
     elapsed, count = elapsed_ns * 1e-9 * sample_rate, len(samples)
     return signed == (samples.dtype.kind == "c") and abs(elapsed - count) <= _jitter(min(elapsed, count))
-
-
-def _named(make: Make) -> str:
-    sample_rate, carrier, signed = make
-    return f"{'I and Q' if signed else 'one mixer'} at {sample_rate:g} Hz, carrier {carrier:.6g} Hz"

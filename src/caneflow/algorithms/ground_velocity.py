@@ -35,6 +35,7 @@ from caneflow.algorithms.quantities import (
     TurnRate,
     Zero,
 )
+from caneflow.algorithms.rest import ground_stands
 from caneflow.algorithms.rotations import Quaternion, Vector, rotate
 from caneflow.physics import GRAVITY, SPEED_OF_LIGHT
 
@@ -68,8 +69,9 @@ class GroundVelocitySettings:
     height_error: Length = 0.03  # m, sd of a person's hand about the rig's height
     height_walk: Density | Zero = 0.002  # m / sqrt(s)
     height_time: Time = 0.5  # s that tell the height as much as one estimate would by itself
-    rest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm, below which nothing seen is rest
+    rest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm, below which standing ground is rest
     rest_speed: Speed = 0.03  # m/s, sd of the antenna's then: drift and tremor of a hand
+    rest_standing: Factor = 0.05  # of a scan's noise, power of the ground that stands then
     heave: HeaveSettings = field(default_factory=HeaveSettings)
 
     def __post_init__(self) -> None:
@@ -106,6 +108,7 @@ class _Cells(NamedTuple):
     per_forward: Floats  # rad per m/s
     per_vertical: Floats  # rad per m/s
     per_height: Floats  # rad per m/s and m
+    first: int  # number of the first of them in the window
 
 
 def beam_factor(cos_grazing: Floats, axis: float, aperture: float) -> Floats:
@@ -182,7 +185,8 @@ class GroundVelocityEstimator:
         coherence = float(np.add.reduce(np.abs(cells.pairs) * np.cos(fit.residual))) / total if total > 0 else 0.0
         if coherence < settings.least_fit:
             turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
-            if turn_rate is not None and turn_rate < settings.rest_turn_rate:
+            still = turn_rate is not None and turn_rate < settings.rest_turn_rate
+            if still and self._ground_stands(returns, cells):
                 return _rest(delay, settings.rest_speed)
             return _nothing(delay)
         if float(np.maximum.reduce(cells.per_forward)) * abs(fit.forward) > settings.alias_share * math.pi:
@@ -224,7 +228,15 @@ class GroundVelocityEstimator:
             per_forward=along,
             per_vertical=sine,
             per_height=along * (-height / (cosine * sums.ranges) ** 2),
+            first=sums.first,
         )
+
+    def _ground_stands(self, returns: MovingReturns, cells: _Cells) -> bool:
+        """Whether the lit cells show ground that stands still."""
+        settings = self._settings
+        standing = self._window.power(returns.standing.scan(), cells.first, len(cells.power))
+        rest = float(np.add.reduce(cells.power)) / (len(cells.power) * settings.window)
+        return ground_stands(standing, rest, returns.standing.noise_share, settings.rest_standing)
 
     def _fit(self, cells: _Cells, rise: float, rise_error: float) -> Fit:
         """Weighted least squares about the best of a few speeds, reweighted for outliers.

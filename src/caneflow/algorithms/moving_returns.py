@@ -1,21 +1,34 @@
 """Radar frames, as they come, into what moves: analytic scans without their background, in even steps of time.
 
 Shared by all estimators of speed, so that none works it out twice. Lost scans leave zeros, the neutral value once
-the background is gone; a longer gap, or a frame of another make, starts anew and says so.
+the background is gone; a longer gap, or frames of another make, start anew and say so.
+
+A scan counts as lost, and leaves no trace in the background, that is far stronger than the others (estimators.md), that
+repeats the one before for the third time (no receiver is without noise: it hangs), or whose frame says that it is of
+another make, e.g. has other ranges, while the frames before and after it do not.
 """
 
+from collections import deque
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from caneflow.algorithms.analytic_signal import AnalyticSignal
+from caneflow.algorithms.analytic_signal import AnalyticSignal, require_band
 from caneflow.algorithms.background import Background
-from caneflow.algorithms.quantities import Time
+from caneflow.algorithms.glitches import JumpGate
+from caneflow.algorithms.quantities import Factor, Time
 
 LARGEST_SAMPLE = 1e12  # the square of its spectrum still fits a float32
+POWER_TIME = 0.5  # s of scans that a wild one is compared with
+FEWEST_POWERS = 10  # scans
+MOST_HELD = 3  # wild scans, or frames of another make, in a row; what lasts longer is believed
+MOST_REPEATS = 2  # of one scan, bit by bit
+FIRST_POWER = 6.0  # by which factor the powers of the first two scans may differ
+FEWEST_FOR_OFFSET = 8  # bins; of fewer, the mean over them is the echoes'
+FORGOTTEN = 1.0  # s without a frame, after which one of another make is believed at once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,16 +48,45 @@ class MovingReturnsSettings:
 
     background_time: Time = 0.5  # s, time constant of the running mean (cane.md row 3)
     longest_gap: Annotated[int, Ge(0), Le(1000)] = 5  # scans that may be missing in a row before all starts anew
+    # of the median power of 0.5 s and of the scan before: more is a wild scan; a cane that sets off gives a factor of 2
+    wild_power: Factor = 6.0
 
 
 class MovingReturns(NamedTuple):
     """What one frame adds."""
 
-    scans: NDArray[np.complex64]  # shape (n, M), oldest first; zeros for scans that were lost before the frame
+    scans: NDArray[np.complex64]  # shape (n, M), oldest first; zeros for scans that were lost
     stamps_ns: tuple[int, ...]  # n stamps, the last is the frame's
-    lost: int  # how many of the n are stand-ins
+    stand_ins: tuple[int, ...]  # those of them that stand for a lost scan
     parameters: RadarParameters
     restarted: bool  # forget all scans before these
+    standing: "StandingPicture"  # valid until the next frame
+
+
+class StandingPicture:
+    """What the background looked like after a frame, for those who need it."""
+
+    def __init__(self, background: Background, to_analytic: AnalyticSignal | None) -> None:
+        self._background, self._to_analytic = background, to_analytic
+
+    def scan(self) -> NDArray[np.complex64]:
+        """The running mean of the scans, shape (M,), without what a receiver adds that is no echo.
+
+        Of real scans with soft ends of the band, so that none rings; of complex ones less the offset of I and Q,
+        which is the same in all bins.
+        """
+        picture = self._background.picture
+        if self._to_analytic is not None:
+            return self._to_analytic.softened(picture)
+        return picture - picture.mean() if len(picture) >= FEWEST_FOR_OFFSET else picture
+
+    @property
+    def noise_share(self) -> float:
+        """Which part of the scans' noise power is in it, 0..1."""
+        return self._background.noise_share
+
+
+Make: TypeAlias = tuple[RadarParameters, int, bool]  # range bins; complex
 
 
 class MovingReturnsFilter:
@@ -52,9 +94,12 @@ class MovingReturnsFilter:
 
     def __init__(self, settings: MovingReturnsSettings) -> None:
         self._settings = settings
-        self._make: tuple[object, ...] = ()  # what may not change between frames
+        self._make: Make | None = None
+        self._makes: JumpGate[Make] = JumpGate(0.0, _apart, most_held=MOST_HELD, longest_gap=FORGOTTEN)
+        self._impossible = 0  # frames in a row of a make that cannot be
         self._to_analytic: AnalyticSignal | None = None  # None: frames are complex already
         self._background = Background(settings.background_time)
+        self._known = _Known(1)
         self._last_ns: int | None = None  # None: nothing to continue
 
     def update(self, stamp_ns: int, scans: NDArray[np.number], parameters: RadarParameters) -> MovingReturns:
@@ -74,8 +119,10 @@ class MovingReturnsFilter:
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"frame at {stamp_ns} ns is not newer than the last, {self._last_ns} ns")
         make = (parameters, bins, kind == "c")
-        if make != self._make:
-            self._start_anew(make, parameters, bins, is_complex=kind == "c")
+        believed = self._believed(stamp_ns, make)
+        if believed != self._make:
+            self._start_anew(believed)
+        parameters, bins, _ = believed
         period_ns = parameters.scan_period * 1e9
         first_ns = stamp_ns - round((count - 1) * period_ns)
         elapsed_ns, lost, restarted = self._since_last(first_ns, period_ns)
@@ -84,17 +131,37 @@ class MovingReturnsFilter:
         if count > 1 or lost:
             stand_ins = (first_ns - elapsed_ns * back // (lost + 1) for back in range(lost, 0, -1))
             stamps = (*stand_ins, *(stamp_ns - round(back * period_ns) for back in range(count - 1, -1, -1)))
+        if believed == make:
+            moving, missing, fresh = self._without_background(scans, elapsed_ns * 1e-9, parameters.scan_period)
+        else:
+            moving, missing, fresh = np.zeros((count, bins), np.complex64), [True] * count, False
+        if lost:
+            moving = np.concatenate([np.zeros((lost, bins), np.complex64), moving])
         return MovingReturns(
-            scans=self._without_background(scans, lost, elapsed_ns * 1e-9, parameters.scan_period),
+            scans=moving,
             stamps_ns=stamps,
-            lost=lost,
+            stand_ins=tuple(stamp for stamp, gone in zip(stamps, [True] * lost + missing, strict=True) if gone),
             parameters=parameters,
-            restarted=restarted,
+            restarted=restarted or fresh,
+            standing=StandingPicture(self._background, self._to_analytic),
         )
 
-    def _start_anew(
-        self, make: tuple[object, ...], parameters: RadarParameters, bins: int, *, is_complex: bool
-    ) -> None:
+    def _believed(self, stamp_ns: int, make: Make) -> Make:
+        """`make`, or that of the frames before; raises ValueError, and takes note of nothing, for an impossible one."""
+        parameters, bins, is_complex = make
+        try:
+            if not is_complex:
+                require_band(bins, parameters.range_step, parameters.carrier, parameters.bandwidth)
+        except ValueError:
+            if self._make is None or self._impossible >= MOST_HELD:
+                raise
+            self._impossible += 1
+            return self._make
+        self._impossible = 0
+        return self._makes.update(stamp_ns, make)
+
+    def _start_anew(self, make: Make) -> None:
+        parameters, bins, is_complex = make
         self._to_analytic = None
         if not is_complex:
             self._to_analytic = AnalyticSignal(
@@ -104,6 +171,7 @@ class MovingReturnsFilter:
                 bandwidth=parameters.bandwidth,
             )
         self._background = Background(self._settings.background_time)
+        self._known = _Known(max(round(POWER_TIME / parameters.scan_period), FEWEST_POWERS))
         self._last_ns = None
         self._make = make
 
@@ -118,12 +186,77 @@ class MovingReturnsFilter:
         return elapsed_ns, lost, False
 
     def _without_background(
-        self, scans: NDArray[np.number], lost: int, elapsed: float, scan_period: float
-    ) -> NDArray[np.complex64]:
+        self, scans: NDArray[np.number], elapsed: float, scan_period: float
+    ) -> tuple[NDArray[np.complex64], list[bool], bool]:
+        """What moves, zeros for what counts as lost, which scans those are, and whether to forget all before."""
         analytic = self._to_analytic(scans) if self._to_analytic else scans.astype(np.complex64)
-        for scan in analytic:
-            self._background.remove(scan, elapsed)
+        missing, fresh, known = self._known.repeated(scans), False, self._known
+        for index, scan in enumerate(analytic):
+            if not missing[index] and known.contradicts(scan):
+                self._background = Background(self._settings.background_time)
+                analytic[:index] = 0.0
+                missing[:index] = [True] * index
+                fresh = True
+            power = self._background.take_off(scan, elapsed)
             elapsed = scan_period
-        if not lost:
-            return analytic
-        return np.concatenate([np.zeros((lost, analytic.shape[1]), dtype=np.complex64), analytic])
+            if missing[index] or known.is_wild(power, self._settings.wild_power):
+                scan[:] = 0.0
+                missing[index] = True
+            else:
+                self._background.learn(scan)
+        return analytic, missing, fresh
+
+
+class _Known:
+    """What is known of the scans so far, to tell what cannot be one of them."""
+
+    def __init__(self, count: int) -> None:
+        """`count`: how many powers are remembered."""
+        self._powers: deque[float] = deque(maxlen=count)
+        self._held = 0  # wild scans in a row
+        self._first: float | None = None  # power of the first scan, background and all, until a second one agrees
+        self._begun = False
+        self._last: NDArray[np.number] | None = None  # the last scan, as it came
+        self._repeats = 0  # of it
+
+    def repeated(self, scans: NDArray[np.number]) -> list[bool]:
+        """Which of `scans`, shape (N, M), say the same as the one before for more than the second time."""
+        found = []
+        for scan in scans:
+            same = self._last is not None and bool((scan == self._last).all())
+            self._repeats = self._repeats + 1 if same else 0
+            self._last = scan
+            found.append(self._repeats > MOST_REPEATS)
+        return found
+
+    def contradicts(self, scan: NDArray[np.complex64]) -> bool:
+        """Whether `scan` is the second one and so unlike the first in power that one of the two is wild.
+
+        The first may be: then it must not stay in the background. If it is the second, the third will say so.
+        """
+        if self._begun and self._first is None:
+            return False
+        parts = scan.view(np.float32)
+        power, first = float(np.add.reduce(parts * parts)), self._first
+        apart = first is not None and max(power, first) > FIRST_POWER * min(power, first)
+        self._first = power if apart or not self._begun else None
+        self._begun = True
+        if apart:
+            self._powers.clear()
+        return apart
+
+    def is_wild(self, power: float, factor: float) -> bool:
+        """Whether a scan has so much more `power`, less the background, than the others; takes note of it if not."""
+        powers = self._powers
+        if len(powers) >= FEWEST_POWERS and power > factor * powers[-1] and self._held < MOST_HELD:
+            middle = len(powers) // 2
+            if power > factor * float(np.partition(powers, middle)[middle]):
+                self._held += 1
+                return True
+        self._held = 0
+        powers.append(power)
+        return False
+
+
+def _apart(one: Make, other: Make) -> float:
+    return float(one != other)

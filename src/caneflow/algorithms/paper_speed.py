@@ -20,7 +20,7 @@ from caneflow.algorithms.footprint import NO_RAYS, CaneGeometry, Fan, RayCaster,
 from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters
 from caneflow.algorithms.quantities import Elevation, Factor, Fraction, OpenFraction, Speed, Zero
 from caneflow.algorithms.range_doppler import SlowTimeWindow, hann, speed_per_bin
-from caneflow.algorithms.rest import RestSettings, is_at_rest, peaks_and_floor
+from caneflow.algorithms.rest import RestSettings, ground_stands, is_at_rest, peaks_and_floor
 from caneflow.algorithms.rotations import Quaternion
 
 RECEDING_SHARE = 0.25  # of the approaching peak: with a beam of 50 deg, walking and swinging stay below it
@@ -101,7 +101,8 @@ class PaperSpeed:
         """The estimate after one more frame.
 
         Not valid while the window is not full or too much of it was lost, without an attitude for its middle,
-        where too few rays meet the ground or agree, where the ground recedes, and near the limit of Doppler.
+        where too few rays meet the ground or agree, where the ground recedes, near the limit of Doppler, and where
+        nothing moves but no ground is seen to stand.
         """
         self._push(returns)
         settings = self._settings
@@ -120,6 +121,8 @@ class PaperSpeed:
         approaching, receding, floor = peaks_and_floor(spectrum, self._cell)
         turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
         if turn_rate is not None and is_at_rest(max(approaching, receding), floor, turn_rate, settings.rest):
+            if not self._ground_stands(returns, rays):
+                return _nothing(delay)
             return SpeedEstimate(speed=0.0, quality=0.0, rays=settings.rays, valid=True, delay=delay)
         if self._has_come_round(spectrum, approaching, receding, floor):
             return _nothing(delay)
@@ -137,8 +140,7 @@ class PaperSpeed:
         for scan in returns.scans:
             self._window.push(scan)
         self._stamps_ns.extend(returns.stamps_ns)
-        if returns.lost:
-            self._stand_ins.extend(returns.stamps_ns[: returns.lost])
+        self._stand_ins.extend(returns.stand_ins)
         while self._stand_ins and self._stand_ins[0] < self._stamps_ns[0]:
             self._stand_ins.popleft()
 
@@ -173,6 +175,18 @@ class PaperSpeed:
         np.add(power[:-2], power[1:-1], out=summed)
         summed += power[2:]
         return summed
+
+    def _ground_stands(self, returns: MovingReturns, rays: Rays) -> bool:
+        """Whether the rays meet ground that stands still."""
+        standing = returns.standing.scan().take(rays.rows, mode="clip")
+        moving = self._window.of(rays.rows)
+        per_scan = np.add.reduce(moving.real**2 + moving.imag**2, axis=1) / len(rays.rows)
+        return ground_stands(
+            standing.real**2 + standing.imag**2,
+            float(np.median(per_scan)),  # not the mean: in the last of them the cane may have set off
+            returns.standing.noise_share,
+            self._settings.rest.least_standing,
+        )
 
     def _has_come_round(self, spectrum: NDArray[np.float32], approaching: float, receding: float, floor: float) -> bool:
         """Whether ground recedes, or approaches so fast that some of its Doppler shows on the other side."""

@@ -31,6 +31,7 @@ class PulsePairs(NamedTuple):
     pairs: NDArray[np.complex128]  # shape (K,), of x(t) conj(x(t - lag T))
     power: Floats  # shape (K,), of the mean of |x(t)|^2 and |x(t - lag T)|^2
     ranges: Floats  # shape (K,) m, of the cells' middles
+    first: int  # number of the first of them among the window's cells
 
 
 def line_phase(pairs: NDArray[np.complexfloating]) -> float:
@@ -86,7 +87,13 @@ class PulsePairWindow:
             pairs=self._in_cells(pairs, last - first).astype(np.complex128),
             power=self._in_cells(0.5 * both, last - first).astype(np.float64),
             ranges=self._ranges[first:last],
+            first=first,
         )
+
+    def power(self, scan: NDArray[np.complex64], first: int, count: int) -> Floats:
+        """Sums of |x|^2 of one `scan`, shape (M,), over the bins of `count` cells from the `first` on."""
+        inside = scan[first * self._bins : (first + count) * self._bins]
+        return self._in_cells(inside.real**2 + inside.imag**2, count).astype(np.float64)
 
     def _in_cells(self, values: NDArray[Any], count: int) -> NDArray[Any]:
         """Sums of `values`, one per bin, over the bins of each of `count` cells."""

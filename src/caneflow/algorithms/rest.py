@@ -1,4 +1,4 @@
-"""Whether the cane is at rest: the radar sees nothing move and the gyro does not turn (cane.md row 9).
+"""Whether the cane is at rest: the radar sees ground, and nothing move, and the gyro does not turn (cane.md row 9).
 
 At rest an edge detector finds an edge in noise, and a metre of walk per stop. Both thresholds are made to need no
 rest before them: the gyro's lies far above its bias, and the radar's is relative to a noise floor that is read off
@@ -18,10 +18,12 @@ import numpy as np
 from annotated_types import Gt, Le
 from numpy.typing import NDArray
 
-from caneflow.algorithms.quantities import TurnRate
+from caneflow.algorithms.quantities import Factor, TurnRate
 
 # The main lobe of the Hann window reaches 2 cells from zero; half a cell more for the drift of a hand at rest.
 STANDING_CELLS = 2.5  # resolution cells of the window to either side of zero Doppler that count as standing
+
+NOISE_MARGIN = 3.0  # times the mean power of noise that the median of a few independent cells may reach
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +35,7 @@ class RestSettings:
     largest_peak: Annotated[float, Gt(1), Le(1e6)] = 7.0  # of the noise floor
     # A gyro's bias is below 2 deg/s, a still hand turns by 0.5; walking turns the cane by 5 deg/s or more.
     largest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm over the window
+    least_standing: Factor = 0.05  # of a scan's noise, power of the ground that stands; more makes faint ground no rest
 
 
 def peaks_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, float, float]:
@@ -59,5 +62,23 @@ def _sides(length: int, cell: float) -> NDArray[np.intp]:
 
 
 def is_at_rest(peak: float, floor: float, turn_rate: float, settings: RestSettings) -> bool:
-    """Whether `peak` is low beside `floor` and the gyro's mean norm `turn_rate` (rad/s) is small."""
+    """Whether `peak` is low beside `floor` and the gyro's mean norm `turn_rate` (rad/s) is small.
+
+    Nothing moves then, that is seen; whether anything is: `ground_stands`.
+    """
     return settings.enabled and peak <= settings.largest_peak * floor and turn_rate <= settings.largest_turn_rate
+
+
+def ground_stands(standing: NDArray[np.floating], rest: float, noise_share: float, least: float) -> bool:
+    """Whether ground is seen to stand: rest is that, and not that nothing is seen.
+
+    Args:
+        standing: shape (K,), power of the standing picture, the running mean of the scans, in each of K cells.
+        rest: mean power per cell of what is left of a scan without that picture, mostly noise; 0 is no receiver's.
+        noise_share: part of the scans' noise power that is in the standing picture's.
+        least: how many times `rest` the ground must have in half of the cells.
+
+    Half of them: the cane's own tip stands still in the radar's frame while it walks, but fills few cells. Ground that
+    passes is not in the mean: at 0.1 m/s it has 2 % of its power there, at 1 m/s nothing.
+    """
+    return rest > 0.0 and float(np.median(standing)) > (least + NOISE_MARGIN * noise_share) * rest
