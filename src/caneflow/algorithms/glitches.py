@@ -11,9 +11,9 @@ from typing import Annotated, Final, Generic, NamedTuple, TypeVar
 
 from annotated_types import Ge, Le
 
-from caneflow.algorithms.dead_reckoning import GRAVITY
 from caneflow.algorithms.quantities import Acceleration, Angle, Time, TurnRate
 from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.physics import GRAVITY
 
 V = TypeVar("V")
 
