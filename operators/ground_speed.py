@@ -85,10 +85,15 @@ class GroundSpeedOperator(Operator):
                 self._velocity.imu(imu.stamp, orientation, accel)
 
     def _speed(self, frame: RadarFrame) -> GroundSpeed:
+        described = DESCRIPTION(frame)
+        parameters = self._parameters
+        if parameters is None or described != self._described:
+            parameters = RadarParameters(**dict(zip(PARAMETERS, described, strict=True)))
         try:
-            returns = self._moving_returns.update(frame.stamp, frame.scans, self._parameters_of(frame))
+            returns = self._moving_returns.update(frame.stamp, frame.scans, parameters)
         except ValueError as error:
             raise Refused(str(error)) from error
+        self._described, self._parameters = described, parameters
         speed = self._paper.update(returns, self._attitudes) if self._paper is not None else NO_SPEED
         velocity = self._velocity.update(returns, self._attitudes) if self._velocity is not None else None
         return GroundSpeed(
@@ -102,13 +107,6 @@ class GroundSpeedOperator(Operator):
             velocity_cov=velocity.covariance if velocity is not None else None,
             velocity_delay=velocity.delay if velocity is not None else None,
         )
-
-    def _parameters_of(self, frame: RadarFrame) -> RadarParameters:
-        described = DESCRIPTION(frame)
-        if self._parameters is None or described != self._described:
-            self._described = described
-            self._parameters = RadarParameters(**dict(zip(PARAMETERS, described, strict=True)))
-        return self._parameters
 
 
 def geometry(rig: Rig) -> CaneGeometry:

@@ -19,7 +19,7 @@ class Background:
         self._mean: NDArray[np.float32] | None = None  # real and imaginary parts in turn
         self._weight = 0.0  # sum of exp(-age / time constant) over the scans seen
         self._squares = 0.0  # sum of the squares of those weights
-        self._share = np.empty((), np.float32)  # 1 / weight, of the type it scales: no casts
+        self._share = np.zeros((), np.float32)  # 1 / weight, of the type it scales: no casts
 
     def remove(self, scan: NDArray[np.complex64], elapsed: float) -> None:
         """Take the mean of the past and itself off `scan`, shape (M,), in place; nothing is left of the first one.

@@ -29,6 +29,9 @@ MOST_REPEATS = 2  # of one scan, bit by bit
 FIRST_POWER = 6.0  # by which factor the powers of the first two scans may differ
 FEWEST_FOR_OFFSET = 8  # bins; of fewer, the mean over them is the echoes'
 FORGOTTEN = 1.0  # s without a frame, after which one of another make is believed at once
+MOST_BINS = (
+    20_000  # of a scan: the longest of a P440 has 16 384; the filter of the pulse takes the square of their number
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +115,8 @@ class MovingReturnsFilter:
         count, bins = scans.shape
         if count == 0 or bins == 0:
             raise ValueError(f"a frame of {count} scans of {bins} bins holds nothing")
+        if bins > MOST_BINS:
+            raise ValueError(f"a frame of {bins} bins; at most {MOST_BINS} are taken")
         kind = scans.dtype.kind
         if kind in "fc" and not np.abs(scans).max() <= LARGEST_SAMPLE:
             # One NaN would stay in the running mean for ever; a huge value would become one.
@@ -162,14 +167,15 @@ class MovingReturnsFilter:
 
     def _start_anew(self, make: Make) -> None:
         parameters, bins, is_complex = make
-        self._to_analytic = None
+        to_analytic = None
         if not is_complex:
-            self._to_analytic = AnalyticSignal(
+            to_analytic = AnalyticSignal(
                 bins=bins,
                 range_step=parameters.range_step,
                 carrier=parameters.carrier,
                 bandwidth=parameters.bandwidth,
             )
+        self._to_analytic = to_analytic  # only now: it raises ValueError for a pulse that the bins cannot hold
         self._background = Background(self._settings.background_time)
         self._known = _Known(max(round(POWER_TIME / parameters.scan_period), FEWEST_POWERS))
         self._last_ns = None

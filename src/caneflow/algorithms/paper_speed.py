@@ -88,10 +88,10 @@ class PaperSpeed:
         self._padded = np.zeros((math.ceil(count / 4) * 4, settings.transform), np.complex64)
         self._rows = self._padded[:count, : settings.window].T
         # Room for what is worked out anew for every scan: to allot it costs as much as to fill it.
-        self._transformed = np.empty_like(self._padded)
+        self._transformed = np.zeros_like(self._padded)
         self._spectra = self._transformed[:count]
-        self._row_power = np.empty(self._spectra.shape, np.float32)
-        self._ray_power = np.empty((settings.rays, settings.transform), np.float32)
+        self._row_power = np.zeros(self._spectra.shape, np.float32)
+        self._ray_power = np.zeros((settings.rays, settings.transform), np.float32)
         self._window = SlowTimeWindow(length=settings.window, bins=0)
         self._caster: RayCaster | None = None
         self._stamps_ns: deque[int] = deque(maxlen=settings.window)

@@ -41,11 +41,13 @@ def let_overflow_raise() -> None:
 def blames_sample(error: Exception) -> str | None:
     """What is wrong with a sample whose handling raised `error`; None: it is the program that is wrong.
 
-    A sample is to blame for numbers that overflow or that make a matrix singular, and for an output whose own checks
-    refuse it. A division by zero, a wrong index and all else are bugs.
+    A sample is to blame for numbers that overflow or that make a matrix singular, for arrays that no memory holds, and
+    for an output whose own checks refuse it. A division by zero, a wrong index and all else are bugs.
     """
     if isinstance(error, OverflowError | FloatingPointError | np.linalg.LinAlgError):
         return f"it makes the arithmetic fail: {one_line(error)}"
+    if isinstance(error, MemoryError):
+        return f"it takes more memory than there is: {one_line(error)}"
     if isinstance(error, MessageError) or (isinstance(error, ValueError) and _is_of_a_sample(error.__traceback__)):
         return f"what follows from it is no sample: {one_line(error)}"
     return None

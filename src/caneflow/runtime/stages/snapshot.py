@@ -209,7 +209,8 @@ class _Packer:
             require_key(item, path)
         items = list(value)
         if not all(map(_is_numbers, items)):
-            return self._items(items, path)  # the order of text is another one in each process
+            # The order of text is another one in each process; here one that is the same for the same elements.
+            return self._items(sorted(items, key=repr), path)
         # The order in which they are put in decides, where two want the same place.
         orders = permutations(items) if len(items) < 6 else (items, items[::-1], sorted(items, key=repr))
         for order in orders:
