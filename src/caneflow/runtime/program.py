@@ -22,7 +22,11 @@ ANY_PORT = "*"  # in `inputs`: every port that is not named takes this type
 
 
 class Refused(CaneflowError):
-    """Raised by `handle` for a message that is well-formed but of no use: counted, named once, life goes on."""
+    """Raised by `handle` for a message that is well-formed but of no use: counted, named once, life goes on.
+
+    Raise it before anything is changed: nothing is undone. What cannot be foreseen need not be checked: a message for
+    which the arithmetic overflows, or from which no valid output follows, is refused by the host, and all undone.
+    """
 
 
 class Encoded(NamedTuple):
