@@ -8,6 +8,7 @@ import math
 import os
 import termios
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -99,6 +100,7 @@ class Bno055(Source):
         self._quiet_until = 0  # ns
         self._levels = (0, 0, 0, 0)
         self._said = ""  # the last warning
+        self._dropped = ""  # why the last reading was
         self._give_up = math.inf  # s, monotonic, unless there is a sample by then
         self._next_revival = 0.0  # s, monotonic
         self._pacing = Pacing(settings.rate, time.monotonic(), chip_rate=bno055.RATE)
@@ -185,12 +187,22 @@ class Bno055(Source):
             report.tell_now_and_then(now)
 
     def _verdict(self, reading: Reading, now: float) -> Verdict | None:
-        """What a reading is; None: its orientation is none, as before the fusion has begun and after a reset."""
-        if bno055.is_rotation(reading.said.orientation):
+        """What a reading is; None: it is dropped, and read again.
+
+        Its orientation is none, as before the fusion has begun and after a reset, or the chip cannot measure that.
+        """
+        if not bno055.is_rotation(reading.said.orientation):
+            self._report.refused += 1
+            self._dropped = "the chip gives no orientation"
+        elif wrong := bno055.impossible(reading.said, self._setup.axes):
+            if wrong not in self._report.impossible:
+                log.warning("a reading with %s, which the chip cannot measure: dropped, as are others like it", wrong)
+            self._report.impossible[wrong] += 1
+            self._dropped = f"the chip says what it cannot measure: {wrong}"
+        else:
             verdict = self._pacing.took(reading.values, now)
             self._report.frozen += verdict is Verdict.FROZEN
             return verdict
-        self._report.refused += 1
         self._pacing.failed(now)
         return None
 
@@ -230,7 +242,7 @@ class Bno055(Source):
         state = chip.state()
         if not chip.works_as(self._setup):
             raise ProtocolError(f"the chip was reset: {state}; is set up anew")
-        what = "the values stand still" if verdict is Verdict.FROZEN else "the chip gives no orientation"
+        what = "the values stand still" if verdict is Verdict.FROZEN else self._dropped
         now = time.monotonic()
         if now > self._next_revival:
             chip.reset()
@@ -277,6 +289,8 @@ class Report:
 
     def __init__(self, pacing: Pacing, period: float) -> None:
         self.spacing = Spacing(period)
+        self.impossible: Counter[str] = Counter()  # readings by what in them cannot be, since the start
+        self._impossible_told = 0
         self._pacing = pacing
         self._link: Link | None = None
         self._clear(time.monotonic())
@@ -289,6 +303,7 @@ class Report:
         self._readings = 0
         self._seconds = 0.0
         self._slowest = 0.0  # s
+        self._impossible_told = self.impossible.total()
         self._pacing.missed = self._pacing.repeated = 0
         self.spacing.clear()
         self._told = now
@@ -326,6 +341,7 @@ class Report:
         troubles = {
             "missed": self._pacing.missed,
             "without orientation": self.refused,
+            "dropped as impossible": self.impossible.total() - self._impossible_told,
             "frozen": self.frozen,
             "gaps": spacing.gaps,
             "before a clock that was set back": self.clock_back,

@@ -120,6 +120,7 @@ class DopplerAdc(Source):
         self._offset = time.time_ns() - time.monotonic_ns()  # of the Unix epoch
         self._said = ""  # the last warning
         self._blocks = self._overflows = self._overflows_told = 0
+        self._refused = self._refused_told = 0  # blocks with what is no sound
         self._next_report = 0.0  # s, monotonic
         self._quiet: dict[int, float] = {}  # by silent channel, s without a change
 
@@ -152,14 +153,14 @@ class DopplerAdc(Source):
                 self._overflows += 1
                 rest = cutter.rest()
                 if rest is not None:
-                    yield "block", self._block(rest, self._epoch(self._clock.at(0)))
+                    yield from self._block(rest, self._epoch(self._clock.at(0)))
                 self._clock.restart()
                 waiting = 0
             self._clock.heard(len(piece.frames), piece.last)
             waiting += len(piece.frames)
             for samples in cutter.feed(channels.output(piece.frames)):
                 waiting -= len(samples)
-                yield "block", self._block(samples, self._epoch(self._clock.at(waiting)))
+                yield from self._block(samples, self._epoch(self._clock.at(waiting)))
             self._report()
 
     def _played(self, path: Path) -> Brought:
@@ -171,21 +172,25 @@ class DopplerAdc(Source):
             taken = (last + 1) / sound.sample_rate
             if (wait := steady + taken - time.monotonic()) > 0:
                 time.sleep(wait)
-            yield "block", self._block(samples, began + round(taken * 1e9), sound.sample_rate)
-        if sound.refused:
-            log.warning("%s: %d blocks left out: they hold what is no number", path, sound.refused)
+            yield from self._block(samples, began + round(taken * 1e9), sound.sample_rate)
+        if refused := sound.refused + self._refused:
+            log.warning("%s: %d blocks left out: they hold what is no number, or no sound", path, refused)
 
-    def _block(self, samples: Samples, stamp: int, sample_rate: float | None = None) -> DopplerBlock:
+    def _block(self, samples: Samples, stamp: int, sample_rate: float | None = None) -> Brought:
+        """A block of them, unless they hold what no converter says: NaN, or floats far beyond full scale."""
         self._blocks += 1
         self._said = ""
         rate = sample_rate or self._settings.sample_rate
+        try:
+            block = DopplerBlock(stamp=stamp, samples=samples, sample_rate=rate, carrier=self._settings.carrier)
+        except ValueError as error:
+            if not self._refused:
+                log.warning("a block is left out, as are others like it: %s", error)
+            self._refused += 1
+            yield Quiet(stamp)
+            return
         self._listen(samples, len(samples) / rate)
-        return DopplerBlock(
-            stamp=stamp,
-            samples=samples,
-            sample_rate=rate,
-            carrier=self._settings.carrier,
-        )
+        yield "block", block
 
     def _listen(self, samples: Samples, seconds: float) -> None:
         """Say of a channel that has become silent which one it is, once until it changes again."""
@@ -221,10 +226,13 @@ class DopplerAdc(Source):
     def _report(self, *, at_once: bool = False) -> None:
         """Say how often frames were missing, once a minute and at the end, if there is something to say."""
         now = time.monotonic()
-        if self._overflows == self._overflows_told or (now < self._next_report and not at_once):
+        news = (self._overflows, self._refused) != (self._overflows_told, self._refused_told)
+        if not news or (now < self._next_report and not at_once):
             return
         self._overflows_told, self._next_report = self._overflows, now + REPORT_PERIOD
-        log.warning("%d overflows in %d blocks: samples are missing there", self._overflows, self._blocks)
+        self._refused_told = self._refused
+        left_out = f"; {self._refused} blocks left out" if self._refused else ""
+        log.warning("%d overflows in %d blocks: samples are missing there%s", self._overflows, self._blocks, left_out)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ out  imu : Imu   gyro, acceleration, magnetic field, 100 Hz; no attitude, put op
 import logging
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,8 +34,10 @@ FASTER = 1.02  # readings for each value: the chip's clock may be 1 % off
 RETRY = 0.1  # s between two looks for a chip that is gone
 SILENCE = 0.3  # s without an answer, after which the bus is opened anew
 MAG_PATIENCE = 0.5  # s without a word of the magnetometer, after which the chip is set up anew
+SATURATED_PATIENCE = 5.0  # s of readings at the end of a range, after which the chip is set up anew
 REVIVAL_PERIOD = 5.0  # s between two attempts to get a chip going whose values stand still
 REPORT_PERIOD = 60.0  # s
+WIDER = "gyro_range and accel_range may be wider (docs/hardware.md)"
 
 Transfer: TypeAlias = Callable[[int, bytes, int], bytes]  # address, what to write, bytes to read after that
 
@@ -93,6 +96,8 @@ class Mpu9250(Source):
         self._last_stamp = 0  # ns, of the last sample
         self._quiet_until = 0  # ns
         self._said = ""  # the last warning
+        self._saturated: Counter[str] = Counter()  # readings that were dropped, by what was at its end, since the start
+        self._saturated_told = 0
         self._faults = Faults()
         self._pacing = self._new_pacing()
         self._spacing = Spacing(1.0 / settings.rate)
@@ -126,7 +131,7 @@ class Mpu9250(Source):
 
     def _measured(self, chip: Chip) -> Brought:
         pacing = self._pacing
-        answered = told = time.monotonic()
+        answered = told = usable = time.monotonic()
         pacing.restart(answered)
         early: int | None = None  # ns, stamp of a reading that came before the values changed
         while True:
@@ -144,6 +149,15 @@ class Mpu9250(Source):
                 continue
             answered = time.monotonic()
             told = self._checked(reading, told, answered)
+            if reading.said.saturated:
+                self._note_saturated(reading.said.saturated)
+                if answered - usable > SATURATED_PATIENCE:
+                    raise ProtocolError(f"nothing but {reading.said.saturated} at the end of its range")
+                pacing.failed(answered)
+                early = None
+                yield self._quiet()
+                continue
+            usable = answered
             verdict = pacing.took(reading.values, answered)
             if verdict is Verdict.REPEATED:
                 early = reading.stamp
@@ -166,6 +180,12 @@ class Mpu9250(Source):
         if now - told > MAG_PATIENCE:
             raise ProtocolError("the magnetometer says nothing")
         return told
+
+    def _note_saturated(self, what: str) -> None:
+        """Count a reading that is dropped: what is at the end of its range was more than it says."""
+        if not self._saturated[what]:
+            log.warning("%s at the end of its range: the reading is dropped, as are others like it; %s", what, WIDER)
+        self._saturated[what] += 1
 
     def _require_change(self, now: float) -> None:
         """Raise ProtocolError now and then while the values stand still, which sets the chip up anew."""
@@ -213,10 +233,13 @@ class Mpu9250(Source):
         spacing, pacing = self._spacing, self._pacing
         if spacing.count:
             log.info(
-                "%d samples every %.3f ms, jitter %.2f, longest %.1f; %d read again, %d missed, %d gaps; %s",
+                "%d samples every %.3f ms, jitter %.2f, longest %.1f; "
+                "%d read again, %d missed, %d gaps, %d dropped as saturated; %s",
                 *(spacing.count, 1e3 * spacing.mean, 1e3 * spacing.jitter, 1e3 * spacing.longest),
-                *(pacing.repeated, pacing.missed, spacing.gaps, self._faults),
+                *(pacing.repeated, pacing.missed, spacing.gaps),
+                *(self._saturated.total() - self._saturated_told, self._faults),
             )
+        self._saturated_told = self._saturated.total()
         spacing.clear()
         pacing.repeated = pacing.missed = 0
         self._faults = Faults()

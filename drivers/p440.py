@@ -46,6 +46,7 @@ PATIENCE_MS = 25  # of the radar's clock, for what others have overtaken ...
 PATIENCE_PERIODS = 4.0  # ... but as long that three scans may overtake one
 BIN_PS = 2  # ps, the finest step of delay, rounded up: how far the radar may move the window's start
 QUANTUM_PS = 5860  # ps, 96 bins of 61.035 ps, rounded up: how far the radar may move its end
+LATEST_START = 500_000  # ps, to either side: a radar can be told to begin at 499 998 at most (MRM_SET_CONFIG_REQUEST)
 RAW = 1  # scan type: neither filtered nor detected
 LOSS_PERIOD = 30.0  # s between two lines about losses
 FIRST_LOSS_LINE = 2.0  # s after the start, when it is known how often the radar scans
@@ -316,7 +317,7 @@ class Framing:
         self._fit = ClockFit(period=settings.nominal_period)
         self._held: list[tuple[int, Scan]] = []  # with stamps, as long as the period is not known
         self.scans = 0  # that came whole
-        self.unfit = 0  # of them: no raw scan, or nothing in it
+        self.unfit = 0  # of them: no raw scan, nothing in it, or from where no radar scans
 
     @property
     def lost(self) -> int:
@@ -336,7 +337,8 @@ class Framing:
     def frames(self, scan: Scan, arrival: int) -> Iterator[RadarFrame]:
         """Yield what `scan`, complete at `arrival` (ns of the host's steady clock), allows to tell."""
         self.scans += 1
-        if scan.scan_type != RAW or not len(scan.samples) or not scan.scan_step_bins:
+        there = abs(scan.scan_start_ps) <= LATEST_START
+        if scan.scan_type != RAW or not len(scan.samples) or not scan.scan_step_bins or not there:
             self.unfit += 1
             return
         stamp = self._clock.epoch(self._fit.update(scan.timestamp_ms, arrival))

@@ -6,6 +6,7 @@ The emulator's clock is a number here, so 60 s at 100 Hz pass at once and the sa
 import itertools
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from caneflow.protocols.bno055 import (
     Mode,
     Register,
     axes,
+    impossible,
     is_rotation,
     measurement,
     registers,
@@ -402,9 +404,53 @@ def test_a_chip_does_not_answer_before_it_has_started() -> None:
 
 
 def test_another_chip_is_refused() -> None:
-    link = UartLink(Scripted([b"\xbb\x01\x71"]), lambda _: None, lambda: 0)
+    link = UartLink(Scripted([b"\xee\x01", b"\xbb\x01\x71"]), lambda _: None, lambda: 0)
     with pytest.raises(ProtocolError, match="chip id 0x71; a BNO055 has 0xA0"):
         Chip(link, lambda _: None).require()
+
+
+def test_a_chip_that_another_program_left_on_page_1_is_found() -> None:
+    made = world(faults=Faults(page=1))
+    assert made.link.read(Register.CHIP_ID, 1).data == b"\0", "there it has no id"
+    made.chip.require()
+    assert made.chip.identity().chip == 0xA0
+
+
+def test_what_the_chip_cannot_measure() -> None:
+    """DS 3.5: 4 g, 2000 deg/s, 1300 uT along x and y and 2500 along z; each with the counts just within and beyond."""
+    good = Measurement(
+        gyro=(0.0, 0.0, 0.0),
+        orientation=(1.0, 0.0, 0.0, 0.0),
+        linear_accel=(0.0, 0.0, 0.0),
+        gravity=(0.0, 0.0, 9.81),
+        temperature=25,
+        calibration=(3, 3, 3, 3),
+        accel=(0.0, 0.0, 9.81),
+        mag=(20.0, 0.0, -40.0),
+    )
+    within: dict[str, Any] = {
+        "gyro": (0.0, math.radians(2000.0), -math.radians(2000.0)),
+        "accel": (-41.0, 41.0, 41.0),
+        "linear_accel": (51.0, -51.0, 0.0),
+        "gravity": (0.0, -10.2, 0.0),
+        "mag": (1350.0, -1350.0, 2047.0),
+        "temperature": 85,
+    }
+    beyond: dict[str, Any] = {
+        "gyro": (0.0, 0.0, -math.radians(2001.0)),
+        "accel": (0.0, -41.5, 0.0),
+        "linear_accel": (52.0, 0.0, 0.0),
+        "gravity": (0.0, 0.0, 10.4),
+        "mag": (0.0, -1400.0, 0.0),
+        "temperature": -102,
+    }
+    for name, value in within.items():
+        assert impossible(good._replace(**{name: value}), axes("+x+y+z")) == ""
+    for name, value in beyond.items():
+        assert impossible(good._replace(**{name: value}), axes("+x+y+z")).startswith(f"{name} beyond")
+    assert impossible(good._replace(mag=None, accel=None), axes("+x+y+z")) == ""
+    turned = good._replace(mag=(0.0, -2000.0, 0.0))
+    assert impossible(turned, axes("+x+z-y")) == "", "the chip's z lies along the body's y"
 
 
 def test_set_up_goes_through_overruns() -> None:

@@ -180,6 +180,41 @@ def test_before_the_fusion_has_begun_there_is_no_sample(source: Any, caplog: pyt
     assert " without orientation" in caplog.messages[-1]
 
 
+def test_a_chip_left_on_page_1_is_found(source: Any) -> None:
+    on = desk(motion(200), Faults(page=1))
+    assert len(samples_of(brought(source(on), on, 2.0))) > 120
+
+
+def test_what_the_chip_cannot_measure_is_dropped_counted_and_said_once(
+    source: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One reading in ten with a value at the end of its register, with zeros, or with 0xFF throughout."""
+    caplog.set_level(logging.INFO)
+    moved = motion(2000)
+    on = desk(moved, Faults(glitches=0.1))
+    got = [sample for _, sample in samples_of(brought(source(on), on, 20.0))]
+    true = {measurement(WHOLE, block).gyro: measurement(WHOLE, block) for block in moved.blocks}
+    for sample in got:
+        said = true[sample.gyro]
+        assert (sample.accel, sample.mag, sample.orientation) == (said.accel, said.mag, said.orientation)
+        assert sample.linear_accel == said.linear_accel
+    assert on.emulator.tally.glitches > 150
+    assert len(got) > 1650
+    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(set(warned)) == len(warned), "each cause once"
+    assert {text.split(" beyond")[0].rpartition(" ")[2] for text in warned} == {
+        "gyro",
+        "accel",
+        "linear_accel",
+        "mag",
+        "temperature",
+    }
+    dropped = re.search(r"(\d+) without orientation, (\d+) dropped as impossible", caplog.messages[-1])
+    assert dropped
+    before_the_fusion = 20
+    assert abs(sum(map(int, dropped.groups())) - on.emulator.tally.glitches) < before_the_fusion
+
+
 def test_an_unplugged_chip_comes_back_within_a_second_and_the_gap_is_told(
     source: Any, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -571,3 +571,19 @@ def test_both_channels_are_told_apart() -> None:
     assert two.silent(np.arange(10) * 1j) == (0,)
     assert two.silent(np.zeros(10, np.complex64)) == (0, 2)
     assert (one.named(3), two.named(0), two.named(2)) == ("channel 3", "channel 0 (I)", "channel 2 (Q)")
+
+
+def test_a_block_that_no_converter_makes_is_left_out_and_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    values = np.random.default_rng(1).normal(0.0, 0.1, 2000).astype(np.float32)
+    values[250], values[450], values[650] = np.nan, 1e30, -1e9
+    soundfile.write(tmp_path / "sound.wav", values, RATE, subtype="FLOAT")
+    with closing(made(file=str(tmp_path / "sound.wav")).samples()) as items:
+        blocks = [item for item in items if not isinstance(item, Quiet)]
+    assert len(blocks) == 7
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(said) == 2
+    assert said[0].startswith("a block is left out, as are others like it: samples has an element of 1e+30")
+    assert said[1].endswith("3 blocks left out: they hold what is no number, or no sound")

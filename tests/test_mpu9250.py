@@ -203,6 +203,42 @@ def test_the_samples_are_what_the_chip_measured(source: Any) -> None:
     assert steps.std() < 1e-3
 
 
+def test_what_is_at_the_end_of_its_range_is_dropped_counted_and_said_once(
+    source: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A swing of 40 rad/s at a range of 1000 deg/s, a blow of 20 g at one of 8, and bits lost on the way."""
+    caplog.set_level(logging.INFO)
+    moved = motion(5.0)
+    for index, (gyro, accel) in {
+        200: ((0.0, 40.0, 0.0), None),
+        300: (None, (-200.0, 0.0, 9.81)),
+        301: (None, (0.0, 0.0, 200.0)),
+    }.items():
+        if gyro:
+            moved.gyro[index] = gyro  # type: ignore[index]  # a list here
+        if accel:
+            moved.accel[index] = accel  # type: ignore[index]  # likewise
+    on = Bench(Emulator(moved, Faults(), np.random.default_rng(7), now=0.0))
+    got = [sample for _, sample in samples_of(brought(source(on), on, 4.5))]
+    at = places(moved, got)
+    assert sorted(set(range(at[0], at[-1] + 1)) - set(at)) == [200, 300, 301]
+    warned = [text for text in caplog.messages if "at the end of its range: the reading is dropped" in text]
+    assert [text.partition(":")[0] for text in warned] == [
+        "gyro at the end of its range",
+        "accel at the end of its range",
+    ]
+    assert "3 dropped as saturated" in caplog.messages[-1]
+
+
+def test_a_chip_at_the_end_of_its_range_for_long_is_set_up_anew(source: Any, caplog: pytest.LogCaptureFixture) -> None:
+    moved = motion(12.0)
+    moved.accel[200:1000] = [(200.0, 0.0, 0.0)] * 800  # type: ignore[index]  # a list here
+    on = Bench(Emulator(moved, Faults(), np.random.default_rng(7), now=0.0))
+    got = samples_of(brought(source(on), on, 11.5))
+    assert max(time for time, _ in got) > 11.0
+    assert any("nothing but accel at the end of its range; tries again" in text for text in caplog.messages)
+
+
 def test_what_is_set_is_what_the_chip_gets(source: Any) -> None:
     on = bench(5.0)
     got = samples_of(brought(source(on, rate=50, gyro_range=2000, accel_range=16, bandwidth=92), on, 2.0))

@@ -9,6 +9,7 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from caneflow.protocols.mrm_scans import Scan, ScanAssembler, parse_log, range_s
 from caneflow.protocols.mrm_serial import SerialDeframer, framed
 from caneflow.runtime import Context, Quiet
 from caneflow.runtime.errors import DataflowError
-from drivers.p440 import P440, Clock, Link, P440Settings, SerialLink, UdpLink
+from drivers.p440 import P440, Clock, Framing, Link, P440Settings, SerialLink, UdpLink
 
 LOGS = Path(__file__).parents[1].parent / "shared" / "data" / "p440-udp-loss"
 CONFIG = mrm.RadarConfig(node_id=9, scan_start_ps=9998, scan_stop_ps=39295)
@@ -127,6 +128,17 @@ def scan(number: int, *, samples: int = 480, period_ms: float = 10.0, boot_ms: f
         operation_mode=1,
         samples=np.random.default_rng(number).integers(-(10**6), 10**6, samples, dtype=np.int32),
     )
+
+
+def test_a_scan_from_where_no_radar_scans_is_left_out_and_counted() -> None:
+    """A radar can be told to begin at -499 998 to 499 998 ps; a header that says 2^31 is damaged."""
+    framing = Framing(P440Settings(), World())
+    damaged = [replace(scan(number), scan_start_ps=start) for number, start in ((20, 2**31 - 1), (21, -600_000))]
+    scans = [scan(number) for number in range(20)] + damaged + [scan(number) for number in range(22, 40)]
+    frames = [frame for one in scans for frame in framing.frames(one, one.timestamp_ms * 1_000_000)]
+    assert framing.unfit == 2
+    assert len(frames) == 38
+    assert len({frame.range_start for frame in frames}) == 1
 
 
 def moments(scans: list[Scan], period: float = 0.01) -> Iterator[Moment]:

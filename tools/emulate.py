@@ -101,6 +101,8 @@ def bno055(
     overruns: Annotated[float, _part_of("the requests that are answered by EE 07, bus overrun")] = 0.0,
     loss: Annotated[float, _part_of("the requests that are never answered")] = 0.0,
     short: Annotated[float, _part_of("the answers that end too early")] = 0.0,
+    glitches: Annotated[float, _part_of("the readings with a value at its end, or all zeros or ones")] = 0.0,
+    page: Annotated[int, typer.Option(min=0, max=1, help="Page of registers that another program left chosen.")] = 0,
     freeze: Annotated[Spans, _spans_in_which("or until a reset, the values stand still")] = None,
     silence: Annotated[Spans, _spans_in_which("it does not answer")] = None,
     unplug: Annotated[Spans, _spans_in_which("there is no port and no power")] = None,
@@ -121,6 +123,8 @@ def bno055(
         overruns=overruns,
         loss=loss,
         short=short,
+        glitches=glitches,
+        page=page,
         freezes=_spans(freeze),
         silences=_spans(silence),
         resets=tuple(reset or ()),
@@ -146,7 +150,7 @@ def bno055(
         tally = chip.tally
         print(
             f"{tally.requests} requests, {tally.overruns} overruns, {tally.lost} lost, {tally.short} cut short; "
-            f"{tally.bursts} readings, "
+            f"{tally.bursts} readings, {tally.glitches} of them glitched, "
             f"of {len(motion.times)} values {len(motion.times) - len(tally.seen)} were not read",
             flush=True,
         )

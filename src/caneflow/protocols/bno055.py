@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Self, TypeAlias
 
+from caneflow.physics import GRAVITY
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.mounting import mounting
 
@@ -92,6 +93,16 @@ GYRO_STEP = math.radians(1.0) / 16.0  # rad/s (DS table 3-22)
 QUATERNION_STEP = 2.0**-14  # (DS p. 36)
 UNIT_TOLERANCE = 1e-3  # how far an orientation's norm may be from 1: that of the wire; rounding makes 6e-5
 
+# What the chip can measure in the fusion modes, whose ranges its firmware sets (DS 3.5), with a twentieth of margin
+# for the offsets that it takes off; without gravity an axis has one g more. It works from -40 to 85 degC.
+MARGIN = 1.05
+MOST_ACCEL = MARGIN * 4.0 * GRAVITY  # m/s^2, 4 g
+MOST_LINEAR_ACCEL = MARGIN * 5.0 * GRAVITY
+MOST_GRAVITY = MARGIN * GRAVITY
+MOST_GYRO = math.radians(2000.0)  # rad/s; the register ends at 2048 deg/s, so there is no room for a margin
+MOST_MAG = (MARGIN * 1300.0, MARGIN * 1300.0, MARGIN * 2500.0)  # uT along x, y, z of the chip
+TEMPERATURES = (-45, 90)  # degC
+
 
 class Measurement(NamedTuple):
     """What the measurement registers say, body axes as remapped."""
@@ -168,6 +179,10 @@ def is_rotation(orientation: Quaternion) -> bool:
     return abs(math.sqrt(w * w + x * x + y * y + z * z) - 1.0) <= UNIT_TOLERANCE
 
 
+def _largest(vector: Vector) -> float:
+    return max(map(abs, vector))
+
+
 def _scaled(counts: Counts3, step: float) -> Vector:
     x, y, z = counts
     return x * step, y * step, z * step
@@ -223,6 +238,25 @@ class Axes:
 
     map: int = 0x24  # AXIS_MAP
     sign: int = 0x00  # AXIS_SIGN
+
+
+def impossible(said: Measurement, axes: Axes) -> str:
+    """What in a measurement the chip cannot have measured, e.g. "accel beyond 4 g"; empty when it can have all.
+
+    `axes`: as it was told to turn its own. A bit that is lost on the way to the host makes such values, and a register
+    that is read while it changes.
+    """
+    most_mag = [MOST_MAG[axes.map >> 2 * axis & 3] for axis in range(3)]
+    low, high = TEMPERATURES
+    beyond = {
+        "gyro beyond 2000 deg/s": _largest(said.gyro) > MOST_GYRO + 0.5 * GYRO_STEP,
+        "accel beyond 4 g": said.accel is not None and _largest(said.accel) > MOST_ACCEL,
+        "linear_accel beyond 5 g": _largest(said.linear_accel) > MOST_LINEAR_ACCEL,
+        "gravity beyond 1 g": _largest(said.gravity) > MOST_GRAVITY,
+        "mag beyond 1300 uT": said.mag is not None and any(abs(b) > m for b, m in zip(said.mag, most_mag, strict=True)),
+        "temperature beyond -40..85 degC": not low <= said.temperature <= high,
+    }
+    return next((what for what, found in beyond.items() if found), "")
 
 
 def axes(text: str) -> Axes:

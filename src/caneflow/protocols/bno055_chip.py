@@ -81,7 +81,11 @@ class Chip:
         self._pause = pause
 
     def require(self) -> None:
-        """Raise ProtocolError unless a BNO055 answers; while it starts, for START_UP or RESET s, it does not."""
+        """Raise ProtocolError unless a BNO055 answers; while it starts, for START_UP or RESET s, it does not.
+
+        Another program may have left it on page 1, where it has no id.
+        """
+        self._choose_page()
         (chip,) = self._read(Register.CHIP_ID, 1)
         if chip != bno055.CHIP_ID:
             raise ProtocolError(f"chip id 0x{chip:02X}; a BNO055 has 0x{bno055.CHIP_ID:02X}")
@@ -104,7 +108,7 @@ class Chip:
 
     def set_up(self, setup: Setup) -> None:
         """Make the chip work as wanted, from whatever state; its fusion begins anew."""
-        self.link.write(Register.PAGE_ID, b"\0")
+        self._choose_page()
         if setup.profile is not None and not self._is_fresh():
             self.reset()  # a fusion that has run does not take a profile (Bosch's moderator)
         self.change_mode(Mode.CONFIG)
@@ -142,6 +146,9 @@ class Chip:
         """What the chip has learnt. It is left in CONFIG mode: only there it tells."""
         self.change_mode(Mode.CONFIG)
         return CalibrationProfile.from_bytes(self._read(Register.PROFILE, PROFILE_BYTES))
+
+    def _choose_page(self) -> None:
+        self.link.write(Register.PAGE_ID, b"\0")
 
     def _choose_clock(self, *, external: bool) -> None:
         wanted = bno055.TRIGGER_EXTERNAL_CRYSTAL if external else 0

@@ -40,6 +40,9 @@ WRITABLE_ALWAYS = {Register.PAGE_ID, Register.MODE}
 WRITABLE_IN_CONFIG = {Register.UNITS, Register.POWER, Register.TRIGGER, Register.AXIS_MAP, Register.AXIS_SIGN}
 PROFILE_REGISTERS = range(Register.PROFILE, Register.PROFILE + PROFILE_BYTES)
 
+# Byte in the WHOLE block, and bytes, of what a glitch may hit: all axes of accelerometer, gyro, quaternion and linear
+# acceleration, x and y of the magnetometer (the end of its z register is within its range), and the temperature.
+GLITCHED = (*((at, 2) for at in (0, 2, 4, 6, 8, 12, 14, 16, 24, 26, 28, 30, 32, 34, 36)), (44, 1))
 NO_VALUES = bytes(bno055.WHOLE.length)
 
 Span = tuple[float, float]  # s from the beginning of the motion, and s that it lasts
@@ -72,6 +75,8 @@ class Faults:
     freezes: tuple[Span, ...] = ()  # the values stand still, unless there is a reset
     silences: tuple[Span, ...] = ()  # no answer
     resets: tuple[float, ...] = ()  # the chip starts anew by itself
+    glitches: float = 0.0  # part of all readings in which a value is at the end of its register, or all are the same
+    page: int = 0  # of the registers, that another program left chosen
 
 
 @dataclass
@@ -83,6 +88,7 @@ class Tally:
     lost: int = 0
     short: int = 0
     bursts: int = 0  # readings of the measurements
+    glitches: int = 0  # of them
     seen: set[int] = field(default_factory=set)  # which of the motion's values were read
 
 
@@ -107,6 +113,7 @@ class Emulator:
         self._resets = deque(sorted(faults.resets))
         self._request_until = now  # when a request that has begun must be complete
         self._start(now, bno055.START_UP)
+        self._page = self._pages[0][Register.PAGE_ID] = self._pages[1][Register.PAGE_ID] = faults.page
 
     def power_on(self, now: float) -> None:
         """Begin anew after a loss of power; the motion goes on."""
@@ -259,7 +266,19 @@ class Emulator:
         if self._mode() == Mode.IMU:
             mag = 6  # bytes from the beginning
             values = values[:mag] + bytes(6) + values[mag + 6 :]  # the magnetometer sleeps
-        return values
+        return self._glitched(values) if self._faults.glitches else values
+
+    def _glitched(self, values: bytes) -> bytes:
+        """The values, now and then with one of them, or all, as a bus makes them that loses bits."""
+        if self._rng.random() >= self._faults.glitches:
+            return values
+        self.tally.glitches += 1
+        at = int(self._rng.integers(len(GLITCHED) + 2))
+        if at >= len(GLITCHED):
+            return bytes([0x00, 0xFF][at - len(GLITCHED) :][:1]) * len(values)
+        offset, size = GLITCHED[at]
+        end = b"\x00\x80" if self._rng.random() < 0.5 else b"\xff\x7f"  # little endian
+        return values[:offset] + end[-size:] + values[offset + size :]
 
     def _write(self, register: int, data: bytes, now: float) -> int | None:
         """Take what is written; what to say of it."""

@@ -121,6 +121,9 @@ class Measurement(NamedTuple):
     mag: Vector | None  # uT; None when it overflowed or has not begun
     was_reset: bool  # the chip does not work as it was set up
     magnetometer_works: bool
+    saturated: str = (
+        ""  # which of gyro and accel is at the end of its range on some axis, so that it is more; else empty
+    )
 
 
 def measurement(data: bytes, scales: Scales) -> Measurement:
@@ -138,6 +141,7 @@ def measurement(data: bytes, scales: Scales) -> Measurement:
         mag=aligned(field) if works and not status & MAG_OVERFLOW else None,
         was_reset=data[: len(SET_UP)] != SET_UP,
         magnetometer_works=works,
+        saturated=" and ".join(name for name, at in (("gyro", 8), ("accel", 4)) if not _within(values[at : at + 3])),
     )
 
 
@@ -161,6 +165,11 @@ def burst(said: Measurement, scales: Scales) -> bytes:
     field = aligned(said.mag) if said.mag is not None else (0.0, 0.0, 0.0)
     status = MAG_16_BITS | (MAG_OVERFLOW if said.mag is None else 0)
     return inertial + _FIELD.pack(1, *_counts(field, scales.mag), status)
+
+
+def _within(counts: tuple[int, ...]) -> bool:
+    """Whether none is the first or the last that 16 bits hold."""
+    return min(counts) > -(2**15) and max(counts) < 2**15 - 1
 
 
 def _scaled(counts: tuple[int, int, int], step: float) -> Vector:
