@@ -29,9 +29,8 @@ MOST_REPEATS = 2  # of one scan, bit by bit
 FIRST_POWER = 6.0  # by which factor the powers of the first two scans may differ
 FEWEST_FOR_OFFSET = 8  # bins; of fewer, the mean over them is the echoes'
 FORGOTTEN = 1.0  # s without a frame, after which one of another make is believed at once
-MOST_BINS = (
-    20_000  # of a scan: the longest of a P440 has 16 384; the filter of the pulse takes the square of their number
-)
+# Of a scan: the longest of a P440 has 16 384; the filter of the pulse takes the square of their number.
+MOST_BINS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
