@@ -180,10 +180,19 @@ def test_what_is_missing_is_given_up_when_the_samples_after_it_use_up_the_budget
 def test_the_names_of_causes_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
     arrivals = Arrivals("echo", "a", InputPlan(key="f/a/imu", schema="caneflow.Imu/1", writer="a"))
     for number in range(2 * CAUSES_NAMED):
-        arrivals.refuse(f"{number} " + "x" * 10**5)
+        arrivals.refuse("y" * (number % LONGEST_CAUSE) + " " + "x" * 10**5)
     assert arrivals.counts.refused == 2 * CAUSES_NAMED
     assert len(caplog.records) == CAUSES_NAMED
     assert max(len(record.getMessage()) for record in caplog.records) < LONGEST_CAUSE + 100
+
+
+def test_a_cause_is_named_once_whatever_its_numbers(caplog: pytest.LogCaptureFixture) -> None:
+    arrivals = Arrivals("echo", "a", InputPlan(key="f/a/imu", schema="caneflow.Imu/1", writer="a"))
+    for found in ("1e+200", "-12.5", "nan", "-inf", "7"):
+        arrivals.refuse(f"gyro is ({found}, 0.0, 0.0); expected -10000 to 10000 rad/s")
+    arrivals.refuse("accel is (1e+200, 0.0, 0.0); expected -4000 to 4000 m/s^2")
+    assert arrivals.counts.refused == 6
+    assert [record.getMessage().split()[2] for record in caplog.records] == ["gyro", "accel"]
 
 
 def test_samples_that_were_dropped_unseen_are_counted_and_said(caplog: pytest.LogCaptureFixture) -> None:
