@@ -144,7 +144,7 @@ class MovingReturnsFilter:
         return MovingReturns(
             scans=moving,
             stamps_ns=stamps,
-            stand_ins=tuple(stamp for stamp, gone in zip(stamps, [True] * lost + missing, strict=True) if gone),
+            stand_ins=_missing(stamps, lost, missing),
             parameters=parameters,
             restarted=restarted or fresh,
             standing=StandingPicture(self._background, self._to_analytic),
@@ -154,7 +154,7 @@ class MovingReturnsFilter:
         """`make`, or that of the frames before; raises ValueError, and takes note of nothing, for an impossible one."""
         parameters, bins, is_complex = make
         try:
-            if not is_complex:
+            if make != self._make and not is_complex:
                 require_band(bins, parameters.range_step, parameters.carrier, parameters.bandwidth)
         except ValueError:
             if self._make is None or self._impossible >= MOST_HELD:
@@ -261,6 +261,13 @@ class _Known:
         self._held = 0
         powers.append(power)
         return False
+
+
+def _missing(stamps: tuple[int, ...], lost: int, missing: list[bool]) -> tuple[int, ...]:
+    """The stamps of `lost` scans before a frame, and of those of the frame that are `missing`."""
+    if True not in missing:
+        return stamps[:lost]
+    return tuple(stamp for stamp, gone in zip(stamps, [True] * lost + missing, strict=True) if gone)
 
 
 def _apart(one: Make, other: Make) -> float:
