@@ -125,7 +125,11 @@ class MagneticHeading:
 
     def averaged(self, elapsed: float) -> None:
         """`elapsed` s of readings have been averaged elsewhere."""
-        self._variance = 1.0 / (1.0 / self._variance + elapsed / self._settings.time_constant**2)
+        reading = self._settings.time_constant**2
+        if not math.isinf(self._variance):
+            self._variance *= reading / (reading + self._variance * elapsed)
+        elif elapsed > 0.0:
+            self._variance = reading / elapsed
 
     def undisturbed(self) -> UndisturbedField | None:
         """The field as it was before the last reading, in the gyro's world; None where it cannot be trusted."""
