@@ -24,7 +24,7 @@ from caneflow.algorithms.dead_reckoning import (
 from caneflow.algorithms.gyro_yaw import GyroYaw
 from caneflow.algorithms.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
-from caneflow.algorithms.quantities import Density, Factor, Fraction, Length, Offset, Speed, Time, Zero
+from caneflow.algorithms.quantities import Density, Factor, Fraction, Length, Offset, Speed, Time, TurnRate, Zero
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized, rotate
 from caneflow.algorithms.standing import StandingDetector, StandingSettings
 from caneflow.algorithms.walk_motion import WalkMotion, WalkMotionSettings
@@ -39,6 +39,11 @@ class CaneFilterSettings:
     velocity_correlation: Time = 0.04
     # m/s, sd of a radar velocity at the least, whatever it states: the best of 20 walks was 0.02
     velocity_error: Speed = 0.015
+    hole: Time = 0.12  # s between IMU samples, from which on acceleration and turn rate are not interpolated
+    hole_speed: Speed = 0.15  # m/s, sd of what the hand's velocity changes over a hole (estimators.md)
+    hole_speed_time: Time = 0.3  # s in which it changes by that much; as a random walk, over other holes
+    longest_hole: Time = 1.5  # s, from which on the velocity is as unknown as at the start
+    hole_turn: TurnRate = math.radians(1.0)  # rad/s, sd of the rate at which the chip's yaw errs over a hole
     disagreement: Time = 1.0  # s of outliers alone, after which the radar is believed again
     speed_noise: Density = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
     speed_patience: Time = 0.5  # s without a velocity before the paper's speed is taken instead
@@ -82,6 +87,11 @@ class _Measured(NamedTuple):
     xx: float  # (m/s)^2
     yy: float  # (m/s)^2
 
+    @property
+    def of_ns(self) -> int:
+        """The time that it belongs to."""
+        return self.stamp_ns - round(self.delay * 1e9)
+
 
 _HISTORY: Final = 64  # IMU samples that a velocity may come late
 _UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
@@ -120,6 +130,8 @@ class CaneFilter:
         self._acceleration = 0j  # m/s^2 in the gyro's frame, of the last sample
         self._last_velocity_ns: int | None = None
         self._disagree_ns: int | None = None  # stamp of the first of the outliers that the last velocities were
+        self._arm = self._arm_speed = 0j  # m, m/s in the gyro's frame: from the IMU to the hand, as of the last sample
+        self._turns = _TurnDoubt()
         self._lonely = False  # the last velocity came after a silence
         self._sees_left = False  # the last velocity observed its component to the left
         self._radar_speed = 0.0  # m/s, the last
@@ -193,16 +205,25 @@ class CaneFilter:
         orientation = normalized(required_orientation(orientation, "best"))
         in_chips_frame = world_acceleration(orientation, accel, linear_accel, "best")
         elapsed = self._clock.interval(stamp_ns) or 0.0
-        interval = elapsed if elapsed <= LONGEST_INTERVAL else 0.0
+        interval = elapsed if elapsed <= min(self._settings.hole, LONGEST_INTERVAL) else 0.0
         stands = self._standing.update(stamp_ns, gyro, in_chips_frame)
-        self._lift(interval, in_chips_frame[2], orientation)
+        self._lift(elapsed, interval, in_chips_frame[2], orientation)
 
         chip_cos, chip_sin = heading_of(orientation, self._boresight)
+        if elapsed > interval:
+            self._yaw.bridge(elapsed)
         self._yaw.update(interval, orientation, gyro, chip_cos, chip_sin)
         turn = cmath.rect(1.0, self._yaw.offset)  # from the chip's frame to the gyro's
         facing = turn * complex(chip_cos, chip_sin)
         before = complex(*self._motion.position)
-        self._predict(elapsed, interval, turn * complex(*in_chips_frame[:2]), facing)
+        acceleration = turn * complex(*in_chips_frame[:2])
+        arm = turn * _horizontal(rotate(orientation, self._pivot))
+        arm_speed = turn * _horizontal(rotate(orientation, _cross(gyro, self._pivot)))
+        if elapsed > interval:
+            self._bridge(stamp_ns, elapsed, arm, arm_speed)
+        else:
+            self._predict(interval, acceleration, facing)
+        self._acceleration, self._arm, self._arm_speed = acceleration, arm, arm_speed
         moved = complex(*self._motion.position) - before
         turned = self._pointing.update(interval, cmath.phase(facing))
         self._remember(stamp_ns, turn, facing, orientation, gyro)
@@ -213,27 +234,45 @@ class CaneFilter:
         self._correction -= shown
 
         self.heading.move(elapsed, turned, moved.real + shown.real, moved.imag + shown.imag)
+        if self._turns.variance > 0.0:
+            self._turns.move(moved + shown)
         self._see_field(orientation)
         self._since_heading += elapsed
         if self._since_heading >= self._settings.heading_interval:
             self._follow_heading()
         return self._estimate(orientation)
 
-    def _lift(self, interval: float, acceleration: float, orientation: Quaternion) -> None:
+    def _lift(self, elapsed: float, interval: float, acceleration: float, orientation: Quaternion) -> None:
         """Up and down; the hand's height is the zero, because only changes of height are given out."""
         height = -rotate(orientation, self._pivot)[2]
+        if elapsed > interval:
+            self._heave.bridge(elapsed)
         self._heave.update(interval, acceleration, height)
         if self._start_height is None:
             self._start_height = height
 
-    def _predict(self, elapsed: float, interval: float, acceleration: complex, facing: complex) -> None:
+    def _predict(self, interval: float, acceleration: complex, facing: complex) -> None:
         mean = 0.5 * (acceleration + self._acceleration)
-        self._acceleration = acceleration
         if interval > 0.0:
             self._gained += self._motion.predict(interval, (mean.real, mean.imag), facing.real, facing.imag)
-        elif elapsed > 0.0:
+
+    def _bridge(self, stamp_ns: int, elapsed: float, arm: complex, arm_speed: complex) -> None:
+        """Over a hole in the samples the hand goes on at its velocity, and the sensors turn about it."""
+        s = self._settings
+        speed_error = s.hole_speed * math.sqrt(elapsed / s.hole_speed_time)
+        gained = self._arm_speed - arm_speed
+        moved = elapsed * self._arm_speed + self._arm - arm
+        if elapsed <= s.longest_hole:
+            self._motion.bridge(elapsed, moved, gained, speed_error)
+        else:
             self._motion.coast(elapsed)
-            self._history.clear()
+        self._gained += gained
+        variance = (s.hole_turn * elapsed) ** 2
+        self.heading.doubt(variance)
+        self._turns.variance += variance
+        # what the radar measured in the hole belongs to an attitude that nobody knows
+        began_ns = stamp_ns - round(elapsed * 1e9)
+        self._waiting = deque((each for each in self._waiting if each.of_ns <= began_ns), self._waiting.maxlen)
 
     def _remember(self, stamp_ns: int, turn: complex, facing: complex, orientation: Quaternion, gyro: Vector) -> None:
         lever = turn * _horizontal(rotate(orientation, _cross(gyro, self._antenna)))
@@ -243,7 +282,7 @@ class CaneFilter:
         """Correct by what waits with a stamp before this sample's: so the order of delivery does not matter."""
         while self._waiting and self._waiting[0].stamp_ns < before_ns:
             measured = self._waiting.popleft()
-            then = self._instant(measured.stamp_ns - round(measured.delay * 1e9))
+            then = self._instant(measured.of_ns)
             since = self._gained - then.gained - then.lever  # from the antenna's velocity then to the IMU's now
             facing = then.facing / abs(then.facing)
             sides = ((facing, measured.forward, measured.xx), (facing * 1j, measured.left, measured.yy))
@@ -329,6 +368,8 @@ class CaneFilter:
         rise = self._heave.height - (self._start_height or 0.0)
         settings = self._settings
         covariance = level_covariance(self._motion.covariance, heading, turn, velocity, settings.speed_scale)
+        if self._turns.variance > 0.0:
+            covariance += self._turns.covariance(turn, velocity)
         covariance *= settings.covariance_share
         covariance[2, 2], covariance[5, 5] = self._heave.height_variance, self._heave.rate_variance
         return PoseEstimate(
@@ -365,6 +406,36 @@ class _Pointing:
             share = min(interval / self._memory, 1.0)
             self.turning += share * ((turned / interval) ** 2 - self.turning)
         return turned
+
+
+class _TurnDoubt:
+    """What unknown turns of the gyro's frame (over holes) do to all that comes after them."""
+
+    def __init__(self) -> None:
+        self.variance = 0.0  # rad^2, of their sum
+        self._mean = 0j  # m rad, covariance of the position with that sum, in the gyro's frame
+        self._xx = self._xy = self._yy = 0.0  # m^2, of the position
+
+    def move(self, moved: complex) -> None:
+        """Go on by so much (m, x + jy, in the gyro's frame): a turn moves the end of it across."""
+        across, before = moved * 1j, self._mean
+        self._mean = after = before + self.variance * across
+        both = before + after
+        self._xx += across.real * both.real
+        self._yy += across.imag * both.imag
+        self._xy += 0.5 * (across.real * both.imag + across.imag * both.real)
+
+    def covariance(self, turn: complex, velocity: complex) -> Floats:
+        """Of position and velocity (6, 6), turned by `turn`; `velocity` (m/s) is in R0 already."""
+        rotation = np.array(((turn.real, -turn.imag), (turn.imag, turn.real)))
+        across, mean = velocity * 1j, self._mean * turn
+        v = np.array((across.real, across.imag))
+        covariance = np.zeros((6, 6))
+        covariance[:2, :2] = rotation @ np.array(((self._xx, self._xy), (self._xy, self._yy))) @ rotation.T
+        covariance[3:5, 3:5] = self.variance * np.outer(v, v)
+        covariance[:2, 3:5] = np.outer((mean.real, mean.imag), v)
+        covariance[3:5, :2] = covariance[:2, 3:5].T
+        return covariance
 
 
 def level_covariance(motion: Floats, heading: Heading, turn: complex, velocity: complex, speed_scale: float) -> Floats:

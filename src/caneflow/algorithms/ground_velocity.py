@@ -17,7 +17,7 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from caneflow.algorithms.attitude_history import AttitudeHistory
+from caneflow.algorithms.attitude_history import LONGEST_STEP_NS, AttitudeHistory
 from caneflow.algorithms.dead_reckoning import LONGEST_INTERVAL
 from caneflow.algorithms.footprint import CaneGeometry, antenna_height, pitch
 from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
@@ -148,6 +148,9 @@ class GroundVelocityEstimator:
         elapsed = (stamp_ns - self._heaves[-1][0]) * 1e-9 if self._heaves else 0.0
         if not 0.0 <= elapsed <= LONGEST_INTERVAL:
             self._heave = HeaveObserver(self._settings.heave)
+            elapsed = 0.0
+        if elapsed > LONGEST_STEP_NS * 1e-9:  # a hole: what the accelerometer said before and after says nothing of it
+            self._heave.bridge(elapsed)
             elapsed = 0.0
         rise = rotate(orientation, accel)[2] - GRAVITY
         self._heave.update(elapsed, rise, antenna_height(self._geometry, orientation))

@@ -15,6 +15,7 @@ _SCALE_ACROSS: Final = math.radians(0.01)  # rad/s, sd of what scale errors leav
 _SCALE_ALONG: Final = math.radians(0.04)  # and along: there two axes with different scales share every turn
 
 
+_RATE_TIME: Final = 0.3  # s over which the rate is averaged at which the chip's yaw is pulled
 _APART: Final = math.radians(120.0)  # rad/s, between gyro and chip, from which on one of them is wild
 
 
@@ -27,6 +28,7 @@ class GyroYaw:
         self._elapsed = 0.0
         self._begins = True  # no two samples have agreed since the start or a gap
         self._across = self._along = 0.0  # rad
+        self._rate = 0.0  # rad/s, of the offset
         self.offset = 0.0  # rad, gyro's yaw less the chip's
 
     def update(self, interval: float, orientation: Quaternion, gyro: Vector, cos_yaw: float, sin_yaw: float) -> None:
@@ -51,10 +53,15 @@ class GyroYaw:
             if not self._begins or max(abs(x), abs(y), abs(z)) <= _APART * interval:
                 self._begins = False
                 self.offset += z
+                self._rate += min(interval / _RATE_TIME, 1.0) * (z / interval - self._rate)
                 self._along += cos_yaw * x + sin_yaw * y
                 self._across += cos_yaw * y - sin_yaw * x
                 self._elapsed += interval
         self._orientation, self._gyro = orientation, gyro
+
+    def bridge(self, elapsed: float) -> None:
+        """Go on by `elapsed` s without a sample: the chip turns with the cane, and is pulled as it was before."""
+        self.offset += self._rate * elapsed
 
     def level_biases(self) -> tuple[float, float, float, float] | None:
         """Bias across the boresight, its sd, along it, its sd, rad/s; None in the first second."""

@@ -64,6 +64,7 @@ class Knot(NamedTuple):
     direction: float  # rad, in the gyro's frame, unwrapped
     noise: float  # rad, sd of the direction
     variance: float  # m^2 per axis, of the position whatever the heading; never falls
+    doubt: float  # rad^2, variance of the turns over holes in the gyro's samples, since the start
 
 
 class Heading(NamedTuple):
@@ -88,6 +89,7 @@ class HeadingHypotheses:
         self._since_knot = 0j  # m, moved since the last knot
         self._knot_due = settings.knot_interval
         self._field_sum, self._field_noise = 0j, 0.0
+        self._doubt = 0.0  # rad^2
         self._knots: list[Knot] = []
         self._spreads: Floats = np.array(settings.bias_spreads)
         self._spread_share = np.full(len(self._spreads), 1.0 / len(self._spreads))
@@ -105,6 +107,10 @@ class HeadingHypotheses:
         self._elapsed += interval
         self._turned += turn
         self._pending += complex(dx, dy)
+
+    def doubt(self, variance: float) -> None:
+        """The last turn was over a hole in the gyro's samples, and is known with this variance (rad^2) only."""
+        self._doubt += variance
 
     def field(self, direction: float, *, from_chip: bool) -> None:
         """Take the direction (rad) of the horizontal field in the gyro's frame, from the chip's yaw if need be."""
@@ -197,7 +203,7 @@ class HeadingHypotheses:
             last = self._knots[-1]
             variance = max(variance, last.variance)
             direction = last.direction + math.remainder(direction - last.direction, 2.0 * math.pi)
-        knot = Knot(self._elapsed, self._turned, self._since_knot, direction, self._field_noise, variance)
+        knot = Knot(self._elapsed, self._turned, self._since_knot, direction, self._field_noise, variance, self._doubt)
         self._since_knot = 0j
         self._knots.append(knot)
         self._condition(len(self._knots) - 1)
@@ -239,10 +245,12 @@ class HeadingHypotheses:
         wide = s.field_scale**2 + knot.variance - np.array([k.variance for k in self._knots[:n]])
         kernel = (s.field_error * s.field_scale) ** 2 / wide * np.exp(apart * apart / (-2.0 * wide))
         kernel += s.rough_error**2 * np.exp(apart / -s.rough_scale) + _CONSTANT
+        if knot.doubt > 0.0:  # a turn that was wrong shifts all directions after it: those of both, up to the earlier
+            kernel += np.array([k.doubt for k in self._knots[:n]])
         # einsum keeps to its own loops: the sums are the same on any number of threads
         factor = self._inverse_factor[:, :n, :n]
         row = np.einsum("hij,hj->hi", factor, kernel)
-        own = s.field_error**2 + s.rough_error**2 + _CONSTANT + knot.noise**2
+        own = s.field_error**2 + s.rough_error**2 + _CONSTANT + knot.noise**2 + knot.doubt
         deviation = np.sqrt(np.maximum(own - (row * row).sum(axis=1), knot.noise**2))
         self._inverse_factor[:, n, :n] = np.einsum("hi,hij->hj", row, factor) / -deviation[:, None]
         self._inverse_factor[:, n, n] = 1.0 / deviation

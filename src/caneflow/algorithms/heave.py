@@ -5,8 +5,11 @@ the nominal height; the accelerometer sees how, the rig sees where. Between them
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 from caneflow.algorithms.quantities import Acceleration, Density, Length
+
+_UNKNOWN_RATE: Final = 0.12  # m/s, sd: a bob of 12 mm at 1.1 Hz
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +62,13 @@ class HeaveObserver:
         self._zv -= gain_z * self._zv
         self._zb -= gain_z * self._zb
         self._zz -= gain_z * self._zz
+
+    def bridge(self, elapsed: float) -> None:
+        """Go on by `elapsed` s without a sample: the height stays, its rate is as unknown as at the start."""
+        self._zz += self._vv * elapsed * elapsed
+        self._zv = self._vb = 0.0
+        self.rate, self._vv = 0.0, _UNKNOWN_RATE**2
+        self._bb += elapsed * self._settings.bias_walk**2
 
     def _predict(self, t: float, acceleration: float) -> None:
         self.height += t * (self.rate + 0.5 * t * acceleration)

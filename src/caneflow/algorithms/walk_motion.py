@@ -91,6 +91,30 @@ class WalkMotion:
         diagonal += self._noise_rates * t
         return complex(gained_x, gained_y)
 
+    def bridge(self, t: float, moved: complex, gained: complex, speed_error: float) -> None:
+        """Go on by `t` s over which nothing was measured: at the velocity of before, but for what is known.
+
+        Which is a way `moved` (m) and a change `gained` (m/s), x + jy; the rest of the change has the sd `speed_error`
+        (m/s per axis) and comes about evenly in time.
+        """
+        x = self._x
+        x[_PX] += t * x[_VX] + moved.real
+        x[_PY] += t * x[_VY] + moved.imag
+        x[_VX] += gained.real
+        x[_VY] += gained.imag
+        f = self._f
+        f[_PX, _VX] = f[_PY, _VY] = t
+        f[_VX, _BF] = f[_VY, _BL] = f[_VX, _BL] = f[_VY, _BF] = 0.0
+        self._p = f @ self._p @ f.T
+        diagonal = self._p.reshape(-1)[::8]
+        diagonal[_BF:] += self._noise_rates[_BF:] * t
+        variance = speed_error**2
+        for position, velocity in ((_PX, _VX), (_PY, _VY)):
+            self._p[velocity, velocity] += variance
+            self._p[position, position] += variance * t * t / 3.0
+            self._p[position, velocity] += 0.5 * variance * t
+            self._p[velocity, position] += 0.5 * variance * t
+
     def coast(self, t: float) -> None:
         """Go on by `t` s over which nothing was measured: the velocity holds, and is as unknown as at the start."""
         self.predict(t, self._bias_in(1.0, 0.0), 1.0, 0.0)
