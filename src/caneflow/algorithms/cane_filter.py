@@ -47,6 +47,9 @@ class CaneFilterSettings:
     disagreement: Time = 1.0  # s of outliers alone, after which the radar is believed again
     speed_noise: Density = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
     speed_patience: Time = 0.5  # s without a velocity before the paper's speed is taken instead
+    # m/s per sqrt(s), by which the velocity may go astray beside what the filter knows of the accelerometer, while no
+    # radar tells it: the chip's tilt and what the last velocities before a silence had wrong
+    unseen_drift: Speed = 0.1
     sideways: Speed = 0.1  # m/s, sd of the hand's velocity across the way the cane points
     sideways_interval: Time = 0.1  # s
     sideways_memory: Time = 1.0  # s over which swinging and turning are noticed
@@ -94,6 +97,7 @@ class _Measured(NamedTuple):
 
 
 _HISTORY: Final = 64  # IMU samples that a velocity may come late
+_VERTICAL: Final = 1e-6  # horizontal part of a unit vector, below which it has no direction
 _UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
 _POINTING_TIME: Final = 0.2  # s
 
@@ -228,6 +232,7 @@ class CaneFilter:
         turned = self._pointing.update(interval, cmath.phase(facing))
         self._remember(stamp_ns, turn, facing, orientation, gyro)
         self._take_velocities(stamp_ns)
+        self._open_while_unseen(stamp_ns, interval)
         self._use_gait(interval, stands, turn, orientation, gyro)
         self._correction += complex(*self._motion.position) - before - moved
         shown = self._correction * min(elapsed / self._settings.correction_time, 1.0)
@@ -284,6 +289,8 @@ class CaneFilter:
             measured = self._waiting.popleft()
             then = self._instant(measured.of_ns)
             since = self._gained - then.gained - then.lever  # from the antenna's velocity then to the IMU's now
+            if not abs(then.facing) > _VERTICAL:
+                continue  # a boresight that points straight up or down tells no direction
             facing = then.facing / abs(then.facing)
             sides = ((facing, measured.forward, measured.xx), (facing * 1j, measured.left, measured.yy))
             for direction, value, variance in sides:
@@ -322,6 +329,12 @@ class CaneFilter:
                 )
             newer = older
         return newer
+
+    def _open_while_unseen(self, stamp_ns: int, interval: float) -> None:
+        """Trust the velocity less and less while no radar tells it."""
+        last_ns, patience = self._last_velocity_ns, self._settings.speed_patience
+        if last_ns is not None and stamp_ns - last_ns > patience * 1e9 and interval > 0.0:
+            self._motion.doubt(self._settings.unseen_drift * math.sqrt(interval), 0.0)
 
     def _use_gait(self, interval: float, stands: bool, turn: complex, orientation: Quaternion, gyro: Vector) -> None:
         """A bearer who stands does not move; one who walks does not move his hand sideways."""

@@ -26,6 +26,8 @@ POWER_TIME = 0.5  # s of scans that a wild one is compared with
 FEWEST_POWERS = 10  # scans
 MOST_HELD = 3  # wild scans, or frames of another make, in a row; what lasts longer is believed
 MOST_REPEATS = 2  # of one scan, bit by bit
+GONE_POWER = 2.5  # taking off the background leaves so many times the power of the scan: what it shows is gone
+GONE_SCANS = 3  # in a row; right after a rest the ground that lay still adds its own power once, so up to 2 times
 FIRST_POWER = 6.0  # by which factor the powers of the first two scans may differ
 FEWEST_FOR_OFFSET = 8  # bins; of fewer, the mean over them is the echoes'
 FORGOTTEN = 1.0  # s without a frame, after which one of another make is believed at once
@@ -202,13 +204,19 @@ class MovingReturnsFilter:
                 analytic[:index] = 0.0
                 missing[:index] = [True] * index
                 fresh = True
+            whole = _power(scan)
             power = self._background.take_off(scan, elapsed)
             elapsed = scan_period
             if missing[index] or known.is_wild(power, self._settings.wild_power):
                 scan[:] = 0.0
                 missing[index] = True
-            else:
-                self._background.learn(scan)
+                continue
+            self._background.learn(scan)
+            if known.is_gone(whole, power):  # the antenna is covered, say: the scene before would look like rest
+                self._background = Background(self._settings.background_time)
+                analytic[: index + 1] = 0.0
+                missing[: index + 1] = [True] * (index + 1)
+                fresh = True
         return analytic, missing, fresh
 
 
@@ -223,6 +231,7 @@ class _Known:
         self._begun = False
         self._last: NDArray[np.number] | None = None  # the last scan, as it came
         self._repeats = 0  # of it
+        self._added = 0  # scans in a row to which the background adds power
 
     def repeated(self, scans: NDArray[np.number]) -> list[bool]:
         """Which of `scans`, shape (N, M), say the same as the one before for more than the second time."""
@@ -241,14 +250,22 @@ class _Known:
         """
         if self._begun and self._first is None:
             return False
-        parts = scan.view(np.float32)
-        power, first = float(np.add.reduce(parts * parts)), self._first
+        power, first = _power(scan), self._first
         apart = first is not None and max(power, first) > FIRST_POWER * min(power, first)
         self._first = power if apart or not self._begun else None
         self._begun = True
         if apart:
             self._powers.clear()
         return apart
+
+    def is_gone(self, whole: float, left: float) -> bool:
+        """Whether the background has added power to several scans: `whole` before it was taken off, `left` after."""
+        self._added = self._added + 1 if left > GONE_POWER * whole else 0
+        if self._added < GONE_SCANS:
+            return False
+        self._added = 0
+        self._powers.clear()
+        return True
 
     def is_wild(self, power: float, factor: float) -> bool:
         """Whether a scan has so much more `power`, less the background, than the others; takes note of it if not."""
@@ -268,6 +285,11 @@ def _missing(stamps: tuple[int, ...], lost: int, missing: list[bool]) -> tuple[i
     if True not in missing:
         return stamps[:lost]
     return tuple(stamp for stamp, gone in zip(stamps, [True] * lost + missing, strict=True) if gone)
+
+
+def _power(scan: NDArray[np.complex64]) -> float:
+    parts = scan.view(np.float32)
+    return float(np.add.reduce(parts * parts))
 
 
 def _apart(one: Make, other: Make) -> float:
