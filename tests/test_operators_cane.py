@@ -169,6 +169,40 @@ def test_a_steady_walk_in_noise_is_never_taken_for_rest() -> None:
         assert all(speed > 0.5 for speed in seen)
 
 
+def covered(since_s: float) -> Iterator[tuple[str, Sample]]:
+    """The walk, its antenna covered from `since_s` on: from there on the scans are noise."""
+    noise, begin = np.random.default_rng(1), walk().stamps_ns[0]
+    for port, message in samples():
+        if isinstance(message, RadarFrame) and message.stamp - begin > since_s * 1e9:
+            scans = np.rint(noise.normal(0.0, 200.0, message.scans.shape)).astype(np.int32)
+            message = msgspec.structs.replace(message, scans=scans)
+        yield port, message
+
+
+def test_when_the_antenna_is_covered_the_walk_before_is_not_taken_for_rest() -> None:
+    operator = GroundSpeedOperator(GroundSpeedSettings(), context(read_rig(walk().rig)))
+    found = [each for each in through(operator, covered(5.0)) if isinstance(each, GroundSpeed)]
+    after = [each for each in found if each.stamp - walk().stamps_ns[0] > 5.2e9]
+    seen = [each for each in after if each.velocity_cov and each.velocity_cov[0] < 1e5]
+    assert [each.velocity for each in seen] == []
+    assert not any(each.valid for each in after)
+
+
+def test_while_no_radar_tells_the_speed_the_pose_says_how_unsure_it_is() -> None:
+    operator = GroundSpeedOperator(GroundSpeedSettings(), context(read_rig(walk().rig)))
+    fusion = Fusion(FusionSettings(method="best"), context(read_rig(walk().rig)))
+    poses: list[Pose] = []
+    for port, message in covered(5.0):
+        if isinstance(message, Imu):
+            poses += [pose for _, pose in fusion.handle("imu", message) if isinstance(pose, Pose)]
+        for _, speed in operator.handle(port, message):
+            list(fusion.handle("speed", speed))
+    sd = [math.sqrt(np.trace(pose.covariance[3:5, 3:5])) for pose in poses if pose.covariance is not None]
+    assert sd[-1] > 2.0 * sd[490], "3 s later, m/s"
+    walked, told = math.hypot(*walk().velocity[-1][:2]), math.hypot(*poses[-1].velocity[:2])
+    assert abs(told - walked) < 2.5 * sd[-1]
+
+
 def steady(made: Walk) -> list[GroundSpeed]:
     """The speeds of its last 2 s."""
     operator = GroundSpeedOperator(GroundSpeedSettings(), context(read_rig(made.rig)))
