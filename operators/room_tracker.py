@@ -7,7 +7,9 @@ in   cane     : Pose            the person's own dead reckoning, whose drift the
 out  pose     : Pose            one per 50 ms, at the first sample of any input that is due
 
 `status` of a pose says on what it rests: `static_or_lost` when no sensor sees anything move or the person is felt to
-stand, `without:west` when the sensor `west` has fallen silent; it is absent when all is well.
+stand, `without:west` when the sensor `west` has fallen silent, `outlier:west` when something that `west` measured since
+the last pose does not fit to where the person can be and was left out, `held:gyro` (or `orientation`, `linear_accel`,
+`cane`) when a single wild reading was held at the one before; it is absent when all is well.
 """
 
 import math
@@ -18,10 +20,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from caneflow.algorithms.dead_reckoning import heading_of
+from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, JumpGate, Readings
 from caneflow.algorithms.quantities import Component, Length, Time, Zero
 from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
 from caneflow.algorithms.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
-from caneflow.algorithms.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor
+from caneflow.algorithms.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor, Vector2
 from caneflow.algorithms.rotations import Quaternion, from_yaw, rotate
 from caneflow.algorithms.standing import StandingDetector, StandingSettings
 from caneflow.messages import DopplerTarget, Imu, MessageError, Pose, Sample
@@ -33,6 +36,8 @@ Method: TypeAlias = Literal["particle", "heading_particle", "ekf", "best"]
 
 IMU, CANE = "imu", "cane"
 SLOWEST_TO_FACE = 0.2  # m/s; without an IMU a slower velocity does not tell which way the person faces
+LEAP = 0.5  # m from one sample of the cane to the next, more than which is held for a few of them
+NATURE_CHANGE = 0.025  # s of a sensor's delay, which does not change
 FLOOR_VARIANCE = 1e-6  # m^2 and m^2/s^2, of the height: the person is on the floor
 
 
@@ -57,6 +62,8 @@ class RoomTrackerSettings:
     forward: tuple[Component, Component, Component] = (1.0, 0.0, 0.0)  # the way the person faces, in the IMU's axes
     standing: StandingSettings = field(default_factory=worn_on_a_belt)
     cane_ahead: Length | Zero = 0.55  # m, of the cane's sensors in front of the person
+    longest_delay: Time = 2.0  # s; what a sensor saw longer ago is of no use
+    glitches: GlitchSettings = field(default_factory=GlitchSettings)  # of the IMU
     silent_after: Time = 0.5  # s without a sample, after which a sensor counts as silent
     particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
     heading_particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
@@ -85,10 +92,20 @@ class RoomTrackerOperator(Operator):
         self._facing: Quaternion | None = None  # by the IMU
         self._course = 0.0  # rad, by the velocity
         self._steps = StandingDetector(settings.standing)
+        self._last_ns: dict[str, int] = {}  # stamp of the last sample of each port
+        self._imu_gate = GlitchGate(settings.glitches)
+        self._cane_gate: JumpGate[Vector2] = JumpGate(LEAP, math.dist, longest_gap=settings.silent_after)
+        self._natures: dict[str, JumpGate[Vector2]] = {
+            name: JumpGate(1.0, math.dist, longest_gap=settings.silent_after) for name in names
+        }
+        self._news: dict[str, None] = {}  # words for the next pose, in order
 
     def handle(self, port: str, message: Sample) -> Emitted:
         """Take the sample; yield a pose when one is due."""
-        discarded = self._tracker.discarded
+        self._require_usable(port, message)
+        self._last_ns[port] = message.stamp
+        if self._begin_ns is None:
+            self._begin_ns = message.stamp
         match message:
             case DopplerTarget():
                 self._take_target(port, message)
@@ -99,39 +116,71 @@ class RoomTrackerOperator(Operator):
         if message.stamp >= self._due_ns:
             self._due_ns = message.stamp + round(self._settings.period * 1e9)
             yield "pose", self._pose(message.stamp)
-        if self._tracker.discarded > discarded:  # so that it is counted and shown
-            raise Refused("a measurement that does not fit to where the person can be is left out")
+
+    def _require_usable(self, port: str, message: Sample) -> None:
+        """Raise Refused before anything has changed."""
+        last = self._last_ns.get(port)
+        if last is not None and message.stamp <= last:
+            raise Refused(f"{port}: stamp {message.stamp} ns is not after the one before, {last} ns")
+        if isinstance(message, Imu) and message.orientation is None:
+            raise Refused("the IMU sample has no orientation; put operators.attitude in front of room_tracker")
 
     def _take_target(self, sensor: str, target: DopplerTarget) -> None:
-        self._hear(target.stamp)
         self._heard_ns[sensor] = target.stamp
-        self._tracker.echo(sensor, echo_of(target))
+        echo = self._echo_of(sensor, target)
+        discarded = self._tracker.discarded
+        if echo is not None:
+            self._tracker.echo(sensor, echo)
+        if echo is None or self._tracker.discarded > discarded:
+            self._news[f"outlier:{sensor}"] = None
+
+    def _echo_of(self, sensor: str, target: DopplerTarget) -> Echo | None:
+        """A target at the time that its value belongs to; None when that is too long ago.
+
+        Delay, and whether the sensor tells the direction, are its nature: a single sample that says otherwise is not
+        believed. While it is not known whether the direction is told, a speed counts as without one.
+        """
+        nature = self._natures[sensor]
+        delay, signed = nature.update(target.stamp, ((target.delay or 0.0) / NATURE_CHANGE, 2.0 * target.signed))
+        delay *= NATURE_CHANGE
+        if nature.holding:
+            self._news[f"held:{sensor}"] = None
+        if delay > self._settings.longest_delay:
+            return None
+        signs = target.signed and signed > 1.0
+        return Echo(
+            stamp_ns=target.stamp - round(delay * 1e9),
+            valid=target.valid,
+            range_rate=target.range_rate if signs else abs(target.range_rate),
+            signed=signs,
+            strength=20.0 * math.log10(target.amplitude) if target.amplitude > 0.0 else None,
+        )
 
     def _take_heading(self, imu: Imu) -> None:
-        self._hear(imu.stamp)
-        if imu.orientation is None:
-            raise Refused("the IMU sample has no orientation; put operators.attitude in front of room_tracker")
-        self._facing = imu.orientation
-        cosine, sine = heading_of(imu.orientation, self._settings.forward)
-        self._tracker.heading(imu.stamp, math.atan2(sine, cosine), self._stands(imu, imu.orientation))
+        assert imu.orientation is not None
+        read = self._imu_gate.update(imu.stamp, Readings(imu.gyro, None, None, imu.orientation, imu.linear_accel))
+        self._news.update(dict.fromkeys(f"held:{part}" for part in self._imu_gate.held))
+        assert read.orientation is not None
+        self._facing = read.orientation
+        cosine, sine = heading_of(read.orientation, self._settings.forward)
+        self._tracker.heading(imu.stamp, math.atan2(sine, cosine), self._stands(imu.stamp, read))
 
     def _take_cane(self, pose: Pose) -> None:
         """The cane is ahead of the person, in the direction in which it points; a swing averages out."""
         assert isinstance(self._tracker, RoomEkf)
-        self._hear(pose.stamp)
         cosine, sine = heading_of(pose.orientation, self._boresight)
         ahead = self._settings.cane_ahead
-        self._tracker.walked(pose.stamp, (pose.position[0] - ahead * cosine, pose.position[1] - ahead * sine))
+        place = self._cane_gate.update(pose.stamp, (pose.position[0] - ahead * cosine, pose.position[1] - ahead * sine))
+        if self._cane_gate.holding:
+            self._news["held:cane"] = None
+        self._tracker.walked(pose.stamp, place)
 
-    def _stands(self, imu: Imu, orientation: Quaternion) -> bool | None:
+    def _stands(self, stamp: int, read: Readings) -> bool | None:
         """Whether the wearer stands; None without an accelerometer."""
-        if imu.linear_accel is None:
+        if read.linear_accel is None:
             return None
-        return self._steps.update(imu.stamp, imu.gyro, rotate(orientation, imu.linear_accel))
-
-    def _hear(self, stamp: int) -> None:
-        if self._begin_ns is None:
-            self._begin_ns = stamp
+        assert read.orientation is not None
+        return self._steps.update(stamp, read.gyro, rotate(read.orientation, read.linear_accel))
 
     def _pose(self, stamp: int) -> Pose:
         estimate = self._tracker.estimate(stamp)
@@ -155,6 +204,8 @@ class RoomTrackerOperator(Operator):
         """What the pose has to do without; None when all is well."""
         words = [] if self._tracker.moving else ["static_or_lost"]
         words += [f"without:{sensor}" for sensor in self._heard_ns if self._is_silent(sensor, stamp)]
+        words += self._news
+        self._news = {}
         return " ".join(words) or None
 
     def _is_silent(self, sensor: str, stamp: int) -> bool:
@@ -198,18 +249,6 @@ def start_of(rig: Rig) -> RoomStart:
     if rig.start is not None:
         return RoomStart(guess=rig.start.position, error=rig.start.sd, area=rig.area)
     return RoomStart(area=rig.need("area"))
-
-
-def echo_of(target: DopplerTarget) -> Echo:
-    """A target at the time that its value belongs to."""
-    strength = 20.0 * math.log10(target.amplitude) if target.amplitude > 0.0 else None
-    return Echo(
-        stamp_ns=target.stamp - round((target.delay or 0.0) * 1e9),
-        valid=target.valid,
-        range_rate=target.range_rate,
-        signed=target.signed,
-        strength=strength,
-    )
 
 
 if __name__ == "__main__":

@@ -337,7 +337,58 @@ def test_a_single_echo_is_not_taken_for_a_person_and_a_share_of_them_is() -> Non
     for hop, stamp in enumerate(stamps[60:]):  # one in 4
         watch.update(stamp, hop % 4 == 0)
     assert watch.moving(stamps[99])
-    assert not watch.moving(stamps[99] + 1_000_000_001)  # nobody says anything
+    assert watch.moving(stamps[99] + 1_000_000_001), "echoes that are missing do not say that nothing moves"
+    assert not watch.moving(stamps[99] + 2_000_000_001), "but after 2 s nobody knows"
+
+
+def test_after_a_hole_a_single_echo_does_not_say_that_the_person_stood() -> None:
+    watch = SilenceWatch(0.7)
+    for hop in range(60):
+        watch.update(START_NS + hop * HOP_NS, True)
+    back = START_NS + 80 * HOP_NS  # 1 s later
+    watch.update(back, False)
+    assert watch.moving(back)
+    for hop in range(81, 95):
+        watch.update(START_NS + hop * HOP_NS, False)
+    assert not watch.moving(START_NS + 94 * HOP_NS)
+
+
+def test_an_echo_that_reaches_far_back_does_not_silence_the_others() -> None:
+    watch = SilenceWatch(0.7)
+    for hop in range(60):
+        watch.update(START_NS + hop * HOP_NS, True)
+    watch.update(START_NS, True)
+    assert watch.moving(START_NS + 60 * HOP_NS)
+
+
+def test_a_leap_of_the_frame_is_no_way() -> None:
+    """As when dead reckoning lays its track anew: the way goes on from there."""
+    way = WayHistory()
+    for k in range(100):
+        leapt = 1e5 if 40 <= k < 70 else 0.0
+        way.add(START_NS + k * 10_000_000, (0.01 * k + leapt, -leapt))
+    east, north = way.between(START_NS, START_NS + 990_000_000)
+    assert east == pytest.approx(0.97, abs=1e-6), "but for the two steps in which it leapt"
+    assert north == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("across", [0.0, 1e-4])
+def test_a_wild_speed_without_sign_does_not_open_the_covariance(across: float) -> None:
+    """Both of its signs are impossible; their mean, about 0, is not."""
+    tracker = RoomEkf(RoomEkfSettings(), SENSORS, RoomStart(guess=(4.0, 4.0), error=0.3))
+    south = SENSORS["south"].position
+    for hop in range(40):
+        stamp = START_NS + hop * HOP_NS
+        tracker.heading(stamp, 0.0)
+        tracker.echo("south", Echo(stamp_ns=stamp, valid=True, range_rate=across, signed=False))
+    at = START_NS + 39 * HOP_NS
+    before = tracker.estimate(at)
+    tracker.echo("south", Echo(stamp_ns=at, valid=True, range_rate=300.0, signed=False))
+    after = tracker.estimate(at)
+    assert abs(before.position[0] - south[0]) < 8.0
+    assert np.trace(after.covariance) <= np.trace(before.covariance)
+    assert after.velocity == pytest.approx(before.velocity)
+    assert tracker.discarded == 1
 
 
 def test_the_antenna_takes_six_decibels_off_an_echo_at_sixty_degrees() -> None:

@@ -360,6 +360,9 @@ class RoomEkf:
             return
         variance = float(h @ self._covariance @ h) + noise
         away, towards = echo.range_rate - expected, -echo.range_rate - expected
+        if min(away**2, towards**2) > s.gate**2 * variance:  # their mean may fit where neither does
+            self.discarded += 1
+            return
         # how much likelier one sign is than the other; both are taken as far as they are likely
         odds = math.exp(min(max(0.5 * (away**2 - towards**2) / variance, -50.0), 50.0))
         share = 1.0 / (1.0 + odds)  # of `away`

@@ -223,7 +223,9 @@ class ParticleTracker(_RoomParticles):
         dt = (stamp_ns - self._now_ns) * 1e-9 if self._now_ns is not None and self.moving else 0.0
         forward = np.eye(4)
         forward[0, 2] = forward[1, 3] = dt
-        return RoomEstimate((x + dt * u, y + dt * v), (u, v), forward @ covariance @ forward.T)
+        walked = self._settings.walk_noise**2 * dt  # m^2/s^2, what the velocity may have changed by since
+        spread = np.kron(np.array([[dt * dt / 3.0, dt / 2.0], [dt / 2.0, 1.0]]), walked * np.eye(2))
+        return RoomEstimate((x + dt * u, y + dt * v), (u, v), forward @ covariance @ forward.T + spread)
 
 
 class HeadingParticleTracker(_RoomParticles):

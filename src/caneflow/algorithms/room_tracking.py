@@ -171,9 +171,16 @@ class HeadingHistory:
 
 
 class WayHistory:
-    """The last positions by dead reckoning, in a frame whose origin is anywhere."""
+    """The last positions by dead reckoning, in a frame whose origin is anywhere.
+
+    A step that nobody walks is a leap of the frame, as when a track is laid anew: no way is gone by it.
+    """
+
+    FASTEST = 10.0  # m/s, a sprinter's
+    LEAST_LEAP = 0.5  # m
 
     def __init__(self) -> None:
+        self._origin: Vector2 = (0.0, 0.0)  # m, what the frame has leapt
         self._stamps: deque[int] = deque(maxlen=HISTORY)
         self._places: deque[Vector2] = deque(maxlen=HISTORY)
 
@@ -181,8 +188,15 @@ class WayHistory:
         """Append a position, m; raises ValueError when time does not go on."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
             raise ValueError(f"position at {stamp_ns} ns is not after the one before, {self._stamps[-1]} ns")
+        x, y = place[0] - self._origin[0], place[1] - self._origin[1]
+        if self._stamps:
+            before = self._places[-1]
+            farthest = self.LEAST_LEAP + self.FASTEST * (stamp_ns - self._stamps[-1]) * 1e-9
+            if math.dist((x, y), before) > farthest:
+                self._origin = place[0] - before[0], place[1] - before[1]
+                x, y = before
         self._stamps.append(stamp_ns)
-        self._places.append(place)
+        self._places.append((x, y))
 
     def between(self, start_ns: int, end_ns: int) -> Vector2:
         """The way from one time to another, m; before the first and after the last position one stands."""
@@ -217,28 +231,35 @@ class SilenceWatch:
     """Whether the sensors see something move (room.md row 11): a single echo may be noise, a share of them is not."""
 
     LEAST_SHARE = 0.06  # of all sensors' echoes; noise alone makes 0.01 to 0.05 of them valid
+    LONGEST_COAST = 2.0  # s without any echo, valid or not, for which whoever walked is taken to walk on
 
     def __init__(self, memory: float) -> None:
         self._memory_ns = round(memory * 1e9)
         self._echoes: deque[tuple[int, bool]] = deque()
         self._valid = 0  # of them
-        self._begin_ns: int | None = None
+        self._begin_ns: int | None = None  # of echoes that tell, at the start and after a hole in them
+        self._newest_ns = 0
 
     def update(self, stamp_ns: int, valid: bool) -> None:
         """Take whether a sensor sees something move."""
-        if self._begin_ns is None:
+        if self._begin_ns is None or stamp_ns - self._newest_ns > self._memory_ns:
             self._begin_ns = stamp_ns
+        self._newest_ns = max(self._newest_ns, stamp_ns)
         self._echoes.append((stamp_ns, valid))
         self._valid += valid
         while self._echoes[0][0] < stamp_ns - self._memory_ns:
             self._valid -= self._echoes.popleft()[1]
 
     def moving(self, stamp_ns: int) -> bool:
-        """Whether enough of the last echoes were valid; true until there has been time to tell."""
+        """Whether enough of the last echoes were valid; true until there has been time to tell.
+
+        Echoes that are missing tell nothing: for a while it is true then, too.
+        """
         if self._begin_ns is None or stamp_ns - self._begin_ns < self._memory_ns:
             return True
-        if stamp_ns - self._echoes[-1][0] > self._memory_ns:
-            return False
+        silent_ns = stamp_ns - self._newest_ns
+        if silent_ns > self._memory_ns:
+            return silent_ns < self.LONGEST_COAST * 1e9
         return self._valid > self.LEAST_SHARE * len(self._echoes)
 
 
