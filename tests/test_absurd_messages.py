@@ -304,13 +304,9 @@ def handled(host: Stage, port: str, message: Sample) -> list[bytes] | None:
 
 
 # Issue 16, items 2 and 7: a sample that these refuse still leaves something behind; see their own changes.
-NEXT = {"fusion best", "doppler", *(name for name in CASES if name.startswith("room_tracker"))}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.xfail(run=False, reason="next")] if name in NEXT else []) for name in CASES],
-)
+@pytest.mark.parametrize("name", CASES)
 @settings(max_examples=16)
 @given(seed=st.integers(0, 2**32), wild=st.sampled_from([0.005, 0.05, 0.3, 1.0]), length=st.sampled_from([0.1, 0.3, 1]))
 def test_whatever_comes_is_handled_or_refused_without_a_trace(name: str, seed: int, wild: float, length: float) -> None:
