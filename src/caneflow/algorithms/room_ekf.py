@@ -360,7 +360,7 @@ class RoomEkf:
             return
         variance = float(h @ self._covariance @ h) + noise
         away, towards = echo.range_rate - expected, -echo.range_rate - expected
-        if min(away**2, towards**2) > s.gate**2 * variance:  # their mean may fit where neither does
+        if min(abs(away), abs(towards)) > s.gate * math.sqrt(variance):  # their mean may fit where neither does
             self.discarded += 1
             return
         # how much likelier one sign is than the other; both are taken as far as they are likely
@@ -372,12 +372,12 @@ class RoomEkf:
     def _correct_robustly(self, h: Array, residual: float, noise: float, spread: float = 0.0) -> None:
         """Student-t: the larger the residual, the less it is believed; none at all beyond the gate."""
         variance = float(h @ self._covariance @ h) + noise
-        normalized = residual**2 / variance
-        if normalized > self._settings.gate**2:
+        normalized = residual / math.sqrt(variance)
+        if abs(normalized) > self._settings.gate:
             self.discarded += 1
             return
         nu = self._settings.degrees
-        noise *= max((nu + normalized) / (nu + 1.0), 1.0)
+        noise *= max((nu + normalized**2) / (nu + 1.0), 1.0)
         self._correct(h, residual, noise, spread)
 
     def _correct(self, h: Array, residual: float, noise: float, spread: float = 0.0) -> None:
