@@ -13,7 +13,7 @@ import zenoh
 from caneflow.messages import GroundSpeed, Imu, Sample, numbered
 from caneflow.messages.control import Again, PortMark, Progress
 from caneflow.runtime import Emitted, Operator, node
-from caneflow.runtime.hosts.bus import Answered, Arrived, Asked, AskEnded, Broken, Event, Marked
+from caneflow.runtime.hosts.process.bus import Answered, Arrived, Asked, AskEnded, Broken, Event, Marked
 from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
 
 PLAN = NodePlan(

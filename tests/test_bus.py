@@ -9,8 +9,8 @@ import zenoh
 
 from caneflow.messages import control_key, encode
 from caneflow.messages.control import Again, PortMark, Progress
-from caneflow.runtime.hosts.bus import AGAIN, Arrived, Asked, Bus, Event, Started
-from caneflow.runtime.hosts.links import Ports, open_session
+from caneflow.runtime.hosts.links.session import Ports, open_session
+from caneflow.runtime.hosts.process.bus import AGAIN, Arrived, Asked, Bus, Event, Started
 from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
 from tests.flows import wait_for
 

@@ -13,7 +13,7 @@ from caneflow.messages.control import PortMark
 from caneflow.recording import RecordingWriter
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.deployment import deploy
-from caneflow.runtime.hosts.inbox import Inbox
+from caneflow.runtime.hosts.process.inbox import Inbox
 from caneflow.runtime.plan import InputPlan
 from caneflow.runtime.stages.byte_budget import (
     CONTROL,

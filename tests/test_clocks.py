@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from caneflow.algorithms.clock_offset import ClockEstimate, ClockOffset, ClockOffsetSettings
 from caneflow.messages import Imu, control_key, decode
 from caneflow.messages.control import Clock
-from caneflow.runtime.hosts.clocks import Answer, Clocks
-from caneflow.runtime.hosts.links import Ports, open_session
+from caneflow.runtime.hosts.launcher.clocks import Answer, Clocks
+from caneflow.runtime.hosts.links.session import Ports, open_session
 from caneflow.runtime.plan import InputPlan
 from caneflow.runtime.stages.streams import Arrivals
 

@@ -20,11 +20,11 @@ from caneflow import __version__, command
 from caneflow.messages import control_key, encode
 from caneflow.messages.control import Delays, EdgeStatus, FlowStatus, NodeStatus
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts import attach
-from caneflow.runtime.hosts.certificates import credentials
-from caneflow.runtime.hosts.diagnosis import Finding, diagnosed, way_to
-from caneflow.runtime.hosts.links import Ports, open_session
-from caneflow.runtime.hosts.run_directory import RunningFlow
+from caneflow.runtime.hosts.attached import attach
+from caneflow.runtime.hosts.attached.diagnosis import Finding, diagnosed, way_to
+from caneflow.runtime.hosts.launcher.run_directory import RunningFlow
+from caneflow.runtime.hosts.links.certificates import credentials
+from caneflow.runtime.hosts.links.session import Ports, open_session
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def endpoint() -> Iterator[str]:
 def keys_of(folder: Path, authority: Path | None = None) -> Path:
     """A folder with a machine and an observer, of an own authority or of the one in `authority`."""
     pytest.importorskip("cryptography", reason="cryptography is not installed: pip install caneflow[secure]")
-    from caneflow.runtime.hosts.certificates import make_authority, make_certificate
+    from caneflow.runtime.hosts.links.certificates import make_authority, make_certificate
 
     if authority is None:
         make_authority(folder)

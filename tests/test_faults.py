@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from caneflow.recording import Recording
-from caneflow.runtime.hosts.certificates import make_authority, make_certificate
+from caneflow.runtime.hosts.links.certificates import make_authority, make_certificate
 from tests.flows import CANEFLOW, NODES, Launched, launchers, results, spread_cane, wait_for, write_walk
 from tests.networks import Faults, Network
 

@@ -11,8 +11,8 @@ import pytest
 import zenoh
 
 from caneflow.messages import GroundSpeed, Pose, Sample, decode, sample_key
-from caneflow.runtime.hosts.links import open_session
-from caneflow.runtime.hosts.run_directory import RunningFlow, running_flows
+from caneflow.runtime.hosts.launcher.run_directory import RunningFlow, running_flows
+from caneflow.runtime.hosts.links.session import open_session
 from tests.flows import NODES, Launched, launchers, node_processes, results, spread_cane, wait_for, write_walk
 
 Launch = Callable[..., Launched]

@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from caneflow.recording import Recording
-from caneflow.runtime.hosts.run_directory import running_flows
+from caneflow.runtime.hosts.launcher.run_directory import running_flows
 from tests.flows import CANEFLOW, NODES, Launched, launchers, node_processes, results, spread_cane, wait_for, write_walk
 
 Launch = Callable[..., Launched]

@@ -6,8 +6,8 @@ import pytest
 
 from caneflow.messages import Imu
 from caneflow.messages.control import PortMark
-from caneflow.runtime.hosts import present
-from caneflow.runtime.hosts.present import Present
+from caneflow.runtime.hosts.process import present
+from caneflow.runtime.hosts.process.present import Present
 from caneflow.runtime.plan import OutputPlan
 from caneflow.runtime.stages.feed import Feed
 from caneflow.runtime.stages.streams import FAR_AHEAD

@@ -11,10 +11,17 @@ import pytest
 
 from caneflow.messages import RadarFrame, numbered, sample_key
 from caneflow.recording import RecordingWriter
-from caneflow.runtime.hosts.attach import attached
-from caneflow.runtime.hosts.certificates import make_authority, make_certificate
-from caneflow.runtime.hosts.congestion import LAUNCHER_STARTS, NODE_STARTS, launcher_ids, node_id, node_ids, tool_links
-from caneflow.runtime.hosts.run_directory import running_flows
+from caneflow.runtime.hosts.attached.attach import attached
+from caneflow.runtime.hosts.launcher.congestion import (
+    LAUNCHER_STARTS,
+    NODE_STARTS,
+    launcher_ids,
+    node_id,
+    node_ids,
+    tool_links,
+)
+from caneflow.runtime.hosts.launcher.run_directory import running_flows
+from caneflow.runtime.hosts.links.certificates import make_authority, make_certificate
 from tests.flows import Launched, free_port, launchers, wait_for
 
 Launch = Callable[..., Launched]

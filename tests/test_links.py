@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.links import Sockets, open_session
+from caneflow.runtime.hosts.links.session import Sockets, open_session
 
 # In a process of its own: a thread that is known once stays known.
 COUNTS = """
 import sys, threading, time, zenoh
-from caneflow.runtime.hosts.links import KnownThreads, Ports, open_session
+from caneflow.runtime.hosts.links.session import KnownThreads, Ports, open_session
 
 endpoint = Ports().endpoint()
 threads, local, counts, came = KnownThreads(), threading.local(), [], threading.Semaphore(0)
@@ -71,7 +71,8 @@ def test_a_folder_that_is_full_of_letters_beyond_ascii_is_measured_in_bytes() ->
 
 def test_a_socket_that_was_left_by_a_killed_process_is_taken_over(tmp_path: Path) -> None:
     endpoint = Sockets(tmp_path).endpoint()
-    listen = f"from caneflow.runtime.hosts.links import open_session; s = open_session(listen=[{endpoint!r}]); print()"
+    opening = "from caneflow.runtime.hosts.links.session import open_session"
+    listen = f"{opening}; s = open_session(listen=[{endpoint!r}]); print()"
     with subprocess.Popen([sys.executable, "-c", f"{listen}; input()"], stdin=-1, stdout=-1) as process:
         assert process.stdout is not None
         process.stdout.readline()

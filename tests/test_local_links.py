@@ -17,9 +17,9 @@ import zenoh
 from caneflow.messages import Imu, control_key, encode, numbered, sample_key
 from caneflow.messages.control import Counters, Progress
 from caneflow.runtime.dataflow.loading import examine
-from caneflow.runtime.hosts.attach import ANY, statuses
-from caneflow.runtime.hosts.links import open_session
-from caneflow.runtime.hosts.run_directory import RunningFlow, running_flows
+from caneflow.runtime.hosts.attached.attach import ANY, statuses
+from caneflow.runtime.hosts.launcher.run_directory import RunningFlow, running_flows
+from caneflow.runtime.hosts.links.session import open_session
 from tests.flows import CANEFLOW, Launched, as_stranger, free_port, launchers, node_processes, wait_for
 
 TICKER = '''

@@ -17,8 +17,8 @@ import zenoh
 from caneflow.messages import Imu, control_key, decode, numbered, sample_key
 from caneflow.messages.control import Counters
 from caneflow.recording import Recording
-from caneflow.runtime.hosts.links import open_session
-from caneflow.runtime.hosts.run_directory import running_flows
+from caneflow.runtime.hosts.launcher.run_directory import running_flows
+from caneflow.runtime.hosts.links.session import open_session
 from tests.flows import BOTH_LINKS, node_processes, write_walk
 
 ROOT = Path(__file__).parents[1]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caneflow.messages.control import Delays
-from caneflow.runtime.hosts.recent_delays import KEPT, RecentDelays, percentile
+from caneflow.runtime.hosts.process.recent_delays import KEPT, RecentDelays, percentile
 
 
 @given(st.lists(st.integers(-(10**9), 10**12), min_size=1, max_size=300), st.sampled_from([0.01, 0.5, 0.9, 0.99, 1.0]))

@@ -16,7 +16,7 @@ from caneflow.recording import Recording, RecordingWriter
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.deployment import Replay, deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.launch import Outcome, note_losses
+from caneflow.runtime.hosts.launcher.launcher import Outcome, note_losses
 
 ROOT = Path(__file__).parents[1]
 START, STEP = 10**13, 10_000_000  # ns

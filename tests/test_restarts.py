@@ -8,9 +8,9 @@ import pytest
 from caneflow.errors import CaneflowError
 from caneflow.runtime.dataflow.graph import Restart
 from caneflow.runtime.dataflow.yaml_shape import RestartShape
-from caneflow.runtime.hosts import last_words
-from caneflow.runtime.hosts.last_words import LastWords, telling_failures, words_of
-from caneflow.runtime.hosts.restarts import Again, Failed, How, Restarts
+from caneflow.runtime.hosts.launcher.restarts import Again, Failed, How, Restarts
+from caneflow.runtime.hosts.process import last_words
+from caneflow.runtime.hosts.process.last_words import LastWords, telling_failures, words_of
 
 DEFAULT = Restart(**RestartShape().model_dump())
 

@@ -13,9 +13,9 @@ import zenoh
 
 from caneflow.messages import Imu, numbered, sample_key
 from caneflow.runtime.dataflow.loading import examine
-from caneflow.runtime.hosts.attach import link_settings
-from caneflow.runtime.hosts.certificates import make_authority, make_certificate
-from caneflow.runtime.hosts.links import open_session
+from caneflow.runtime.hosts.attached.attach import link_settings
+from caneflow.runtime.hosts.links.certificates import make_authority, make_certificate
+from caneflow.runtime.hosts.links.session import open_session
 from tests.flows import CANEFLOW, Launched, free_port, launchers, results, spread_cane, wait_for, write_walk
 
 Launch = Callable[..., Launched]

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts import attach
-from caneflow.runtime.hosts.run_directory import (
+from caneflow.runtime.hosts.attached import attach
+from caneflow.runtime.hosts.launcher.run_directory import (
     RunDirectory,
     RunningFlow,
     refused_addresses,
@@ -41,7 +41,7 @@ def common(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    monkeypatch.setattr("caneflow.runtime.hosts.run_directory._roots", lambda: list(folder.glob("caneflow-*")))
+    monkeypatch.setattr("caneflow.runtime.hosts.launcher.run_directory._roots", lambda: list(folder.glob("caneflow-*")))
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
 

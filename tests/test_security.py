@@ -18,10 +18,10 @@ from caneflow.messages import Imu, control_key, numbered, sample_key, stream_of
 from caneflow.runtime.dataflow.loading import examine, load
 from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.certificates import certificates, credentials, make_authority, make_certificate
-from caneflow.runtime.hosts.links import open_session
-from caneflow.runtime.hosts.run_directory import running_flows
-from caneflow.runtime.hosts.security import access_control, check_access_control, machine_grants
+from caneflow.runtime.hosts.launcher.run_directory import running_flows
+from caneflow.runtime.hosts.links.access import access_control, check_access_control, machine_grants
+from caneflow.runtime.hosts.links.certificates import certificates, credentials, make_authority, make_certificate
+from caneflow.runtime.hosts.links.session import open_session
 from tests.flows import CANEFLOW, Launched, free_port, launchers, spread_cane, wait_for
 
 DATAFLOWS = Path(__file__).parents[1] / "dataflows"

@@ -17,7 +17,7 @@ from caneflow.messages import Imu, decode
 from caneflow.messages.control import Again, PortMark
 from caneflow.recording import Recording
 from caneflow.runtime import Brought, Quiet, Source, node
-from caneflow.runtime.hosts.bus import Asked, Confirmed, Event, Started
+from caneflow.runtime.hosts.process.bus import Asked, Confirmed, Event, Started
 from caneflow.runtime.plan import NodePlan, OutputPlan
 from tests.flows import CANEFLOW, launchers, node_processes, wait_for
 

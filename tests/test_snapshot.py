@@ -439,7 +439,7 @@ HOSTILE = [
             f"{HERE}:sys.exit",
             f"{HERE}:Imu",
             f"{HERE}:State.__init__",
-            "caneflow.runtime.hosts.launch:Launcher",
+            "caneflow.runtime.hosts.launcher.launcher:Launcher",
             "caneflow.algorithms.no_such_module:Thing",
         )
         for tag, number, rest in (

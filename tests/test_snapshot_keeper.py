@@ -13,7 +13,7 @@ import pytest
 
 from caneflow.messages import GroundSpeed, Imu, Sample, numbered
 from caneflow.runtime import Context, Emitted, Operator, node
-from caneflow.runtime.hosts.bus import Arrived, Event
+from caneflow.runtime.hosts.process.bus import Arrived, Event
 from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.snapshot_keeper import LAYOUT, Snapshot, SnapshotKeeper

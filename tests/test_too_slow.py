@@ -7,8 +7,8 @@ import pytest
 
 from caneflow.messages.control import EdgeStatus
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attach import attached
-from caneflow.runtime.hosts.observations import OLD
+from caneflow.runtime.hosts.attached.attach import attached
+from caneflow.runtime.hosts.launcher.node_statistics import OLD
 from tests.flows import Launched, launchers, wait_for
 
 FLOW = """

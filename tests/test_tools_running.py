@@ -19,9 +19,9 @@ from caneflow.errors import CaneflowError
 from caneflow.messages import Imu, numbered, sample_key
 from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
 from caneflow.recording import Recording
-from caneflow.runtime.hosts import attach
-from caneflow.runtime.hosts.attach import Attached, Heard, attached, parted
-from caneflow.runtime.hosts.run_directory import RunningFlow, running_flows
+from caneflow.runtime.hosts.attached import attach
+from caneflow.runtime.hosts.attached.attach import Attached, Heard, attached, parted
+from caneflow.runtime.hosts.launcher.run_directory import RunningFlow, running_flows
 from tools.echo import missed_told
 
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]

@@ -17,7 +17,7 @@ import pytest
 from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, decode, numbered, sample_key
 from caneflow.messages.rig import Rig
 from caneflow.recording import RecordingWriter
-from caneflow.runtime.hosts.attach import ANY, Heard, attached
+from caneflow.runtime.hosts.attached.attach import ANY, Heard, attached
 from caneflow.viewing.columns import row_of
 from caneflow.viewing.live import LiveStreams
 

@@ -17,8 +17,8 @@ from caneflow.printable import printable
 from caneflow.runtime import Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.hosts.attach import DEFAULT_KEYS
-from caneflow.runtime.hosts.diagnosis import Finding, diagnosed
+from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS
+from caneflow.runtime.hosts.attached.diagnosis import Finding, diagnosed
 
 TROUBLE_STATUS = 1
 CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {

@@ -17,7 +17,7 @@ from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, MessageError, Sample, decode
 from caneflow.options import At, Keys
 from caneflow.printable import printable
-from caneflow.runtime.hosts.attach import ANY, DEFAULT_KEYS, Heard, attached, parted
+from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Heard, attached, parted
 
 MOST_WAITING = 10_000  # samples that may wait to be printed
 SHOWN = 3  # elements of an array on either side, on a line

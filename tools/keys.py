@@ -10,8 +10,8 @@ import typer
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts import certificates
-from caneflow.runtime.hosts.security import router_settings
+from caneflow.runtime.hosts.links import certificates
+from caneflow.runtime.hosts.links.access import router_settings
 
 Folder = Annotated[Path, typer.Option("--keys", metavar="DIR", help="where they are kept")]
 DEFAULT_FOLDER = Path("keys")  # `caneflow run FILE` looks for it beside the file

@@ -10,7 +10,7 @@ from caneflow.errors import CaneflowError
 from caneflow.options import At, Keys
 from caneflow.printable import printable
 from caneflow.recording.parts import WRITE_NOW
-from caneflow.runtime.hosts.attach import DEFAULT_KEYS, attached
+from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
 
 
 def command(

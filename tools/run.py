@@ -21,9 +21,9 @@ from caneflow.runtime.dataflow.loading import load, read_rig
 from caneflow.runtime.deployment import Deployment, Replay, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
-from caneflow.runtime.hosts.launch import Launcher, Outcome
-from caneflow.runtime.hosts.nursery import Nursery
-from caneflow.runtime.hosts.open_files import raise_limit, require_open_files
+from caneflow.runtime.hosts.launcher.fork_server import ForkServer
+from caneflow.runtime.hosts.launcher.launcher import Launcher, Outcome
+from caneflow.runtime.hosts.launcher.open_files import raise_limit, require_open_files
 from caneflow.runtime.wording import listed
 
 SLOWEST, FASTEST = 1e-3, 1e6  # times real time: 17 min for a second; a year in half a minute, faster than any computer
@@ -97,10 +97,10 @@ def command(
     recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
     if record is not None:
         record = named_at(record, datetime.now(UTC))
-    # The recording's name first, before any process; then the nursery: what is there now is there in every node.
+    # The recording's name first, before any process; then the fork_server: what is there now is there in every node.
     with (
         _kept(record, [file, replay, rig], overwrite=overwrite, parts=bool(recorder)),
-        nullcontext() if in_process else Nursery() as nursery,
+        nullcontext() if in_process else ForkServer() as fork_server,
     ):
         graph = load(file, settings or ())
         for warning in graph.warnings:
@@ -118,15 +118,15 @@ def command(
             rig=_rig(rig),
             machine=None if in_process else machine,
         )
-        if nursery is not None:
+        if fork_server is not None:
             require_open_files(sum(map(deployment.runs_here, deployment.plans)))
         started = time.monotonic()
-        if nursery is None:
+        if fork_server is None:
             programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
             outcome = InProcess(deployment, programs).run_until_interrupted()
         else:
             restarts = {name: node.restart for name, node in graph.nodes.items()}
-            outcome = Launcher(deployment, restarts, report, nursery, keys or file.parent / "keys").run()
+            outcome = Launcher(deployment, restarts, report, fork_server, keys or file.parent / "keys").run()
         summary(deployment, outcome, time.monotonic() - started)
         raise typer.Exit(outcome.status)
 

@@ -9,7 +9,7 @@ import typer
 
 from caneflow.messages.control import Delays, EdgeStatus, FlowStatus, NodeStatus
 from caneflow.options import At, Keys
-from caneflow.runtime.hosts.attach import DEFAULT_KEYS, attached
+from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
 from caneflow.runtime.wording import in_columns
 
 PLACES = ("sender", "wire", "decode", "queue", "late")  # where a sample may be lost, on its way

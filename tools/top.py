@@ -10,7 +10,7 @@ import typer
 
 from caneflow.messages.control import FlowStatus, NodeStatus
 from caneflow.options import At, Keys
-from caneflow.runtime.hosts.attach import DEFAULT_KEYS, attached
+from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
 from caneflow.runtime.wording import in_columns
 
 

@@ -26,8 +26,8 @@ from caneflow.messages.rig import Rig, read_rig
 from caneflow.options import At, Keys
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attach import ANY, DEFAULT_KEYS, Attached, Heard, attached
-from caneflow.runtime.hosts.run_directory import running_flows
+from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Attached, Heard, attached
+from caneflow.runtime.hosts.launcher.run_directory import running_flows
 from caneflow.runtime.node import run
 from caneflow.viewing.live import LiveStreams
 from caneflow.viewing.recorded import RecordedStreams

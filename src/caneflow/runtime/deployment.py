@@ -18,7 +18,7 @@ from caneflow.messages.rig import overlaid, read_rig
 from caneflow.recording import TRUTH, Recording
 from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.links import Ports, Sockets
+from caneflow.runtime.hosts.links.session import Ports, Sockets
 from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
 from caneflow.runtime.stages.byte_budget import SENT, share
 from caneflow.runtime.wording import did_you_mean, listed

@@ -22,7 +22,7 @@ from caneflow.messages import MessageError, Sample, decode, numbered
 from caneflow.messages.control import Again, Clock, Counters, PortMark, Progress
 from caneflow.messages.rig import read_rig
 from caneflow.runtime.dataflow.programs import validated_settings
-from caneflow.runtime.hosts.bus import (
+from caneflow.runtime.hosts.process.bus import (
     Answered,
     Arrived,
     Asked,
@@ -40,9 +40,9 @@ from caneflow.runtime.hosts.bus import (
     Timed,
     check_schema,
 )
-from caneflow.runtime.hosts.last_words import telling_failures
-from caneflow.runtime.hosts.present import Present
-from caneflow.runtime.hosts.recent_delays import RecentDelays
+from caneflow.runtime.hosts.process.last_words import telling_failures
+from caneflow.runtime.hosts.process.present import Present
+from caneflow.runtime.hosts.process.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Context, Encoded, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.stages.byte_budget import WAITING, weight

@@ -15,7 +15,7 @@ from caneflow.messages import MessageError, Sample, decode, encode, with_number
 from caneflow.messages.control import Counters
 from caneflow.runtime.deployment import RECORDER_MODULE, REPLAYER_MODULE, Deployment
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.launch import Outcome, note_losses
+from caneflow.runtime.hosts.launcher.launcher import Outcome, note_losses
 from caneflow.runtime.node import build
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from caneflow.runtime.hosts.nursery import Ended, Nursery, Started
+from caneflow.runtime.hosts.launcher.fork_server import Ended, ForkServer, Started
 
 LINES_PATIENCE = 1.0  # s that the last lines of an ended node have to come: a child of it may hold the pipe open
 
@@ -31,7 +31,7 @@ class Exited(NamedTuple):
     status: int  # negative: the signal that ended it
 
 
-class NurseryLost(NamedTuple):
+class ForkServerLost(NamedTuple):
     """The process that starts nodes has been killed, and every node with it."""
 
 
@@ -49,13 +49,13 @@ class _Process:
 class Processes:
     """Starts, watches and ends one process per node; a context manager that leaves none behind."""
 
-    def __init__(self, events: "queue.SimpleQueue[object]", nursery: Nursery) -> None:
+    def __init__(self, events: "queue.SimpleQueue[object]", fork_server: ForkServer) -> None:
         self._events = events
-        self._nursery = nursery
+        self._fork_server = fork_server
         self._running: dict[str, _Process] = {}
-        self._asked: queue.SimpleQueue[_Process] = queue.SimpleQueue()  # which the nursery will start, in this order
+        self._asked: queue.SimpleQueue[_Process] = queue.SimpleQueue()  # to be started, in this order
         self._closing = False
-        self._listener = threading.Thread(target=self._listen, daemon=True, name="nursery")
+        self._listener = threading.Thread(target=self._listen, daemon=True, name="fork server")
 
     def __enter__(self) -> "Processes":
         self._listener.start()
@@ -64,13 +64,13 @@ class Processes:
     def __exit__(self, *_: object) -> None:
         self.end(list(self._running), patience=1.0)
         self._closing = True
-        self._nursery.close()
+        self._fork_server.close()
         self._listener.join()
 
     def start(self, node: str, program: Sequence[str], plan: bytes, called: Path) -> int:
         """Start the node's process with its plan, `called` so where processes are listed.
 
-        Its pid, or 0 when the nursery is lost. Raises OSError when this process has no descriptors left.
+        Its pid, or 0 when the fork_server is lost. Raises OSError when this process has no descriptors left.
         """
         with _in_memory(plan) as descriptor:
             return self._start(node, [*program, str(called)], descriptor)
@@ -82,7 +82,7 @@ class Processes:
         process.reader.start()
         try:
             self._asked.put(process)
-            self._nursery.start(arguments, writing, plan)
+            self._fork_server.start(arguments, writing, plan)
             process.started.wait()
         except OSError:
             return 0  # the listener knows as well, and has said so
@@ -128,9 +128,9 @@ class Processes:
         return killed
 
     def _listen(self) -> None:
-        """Follow what the nursery says until it ends."""
+        """Follow what the fork server says until it ends."""
         there: dict[int, _Process] = {}
-        while (word := self._nursery.hear()) is not None:
+        while (word := self._fork_server.hear()) is not None:
             match word:
                 case Started(pid):
                     process = there[pid] = self._asked.get()
@@ -141,7 +141,7 @@ class Processes:
                     process.ended.set()
                     threading.Thread(target=self._tell_end, args=(process, status), daemon=True).start()
         if not self._closing:
-            self._events.put(NurseryLost())
+            self._events.put(ForkServerLost())
         while not self._asked.empty():
             self._asked.get().started.set()
         for process in there.values():

@@ -20,8 +20,8 @@ from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, enc
 from caneflow.messages.codec import MAX_SEQ
 from caneflow.messages.control import Again, Clock, Counters, LeftOut, PortMark, Progress, Window
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.inbox import Inbox
-from caneflow.runtime.hosts.links import KnownThreads, open_session, sending_now, sent_at
+from caneflow.runtime.hosts.links.session import KnownThreads, open_session, sending_now, sent_at
+from caneflow.runtime.hosts.process.inbox import Inbox
 from caneflow.runtime.plan import InputPlan, NodePlan
 from caneflow.runtime.stages.byte_budget import CONTROL, INBOX, PER_REQUEST, PER_SAMPLE, share
 

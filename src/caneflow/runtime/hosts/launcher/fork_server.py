@@ -1,7 +1,7 @@
 """The process that a flow's nodes are forked from, so that what they all import is imported once.
 
-A node that starts as an interpreter of its own spends half a second on imports, at every restart too. The nursery is
-forked from the launcher before that has threads, links or users' code, none of which survives a fork. It is the
+A node that starts as an interpreter of its own spends half a second on imports, at every restart too. The fork server
+is forked from the launcher before that has threads, links or users' code, none of which survives a fork. It is the
 parent of the nodes: it tells how each ends, and when the launcher dies, however it dies, it kills them all.
 """
 
@@ -24,7 +24,7 @@ from typing import NoReturn
 import msgspec
 from setproctitle import setproctitle, setthreadtitle
 
-from caneflow.runtime.hosts.last_words import telling_failures
+from caneflow.runtime.hosts.process.last_words import telling_failures
 
 REQUEST_BYTES = 65_536  # of the longest command line
 PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal for a process whose parent dies
@@ -47,13 +47,13 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
     status: int  # negative: the signal that ended it
 
 
-class Nursery:
+class ForkServer:
     """The launcher's end: start nodes, and hear of their ends; a context manager that leaves none."""
 
     def __init__(self) -> None:
-        """Fork the nursery; to be done before this process has any thread."""
+        """Fork the fork server; to be done before this process has any thread."""
         self._socket, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        # Ctrl-C reaches both processes: the nursery must not take it as the launcher would.
+        # Ctrl-C reaches both processes: the fork server must not take it as the launcher would.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, FROM_OUTSIDE)
         self.pid = os.fork()
         if self.pid == 0:
@@ -62,7 +62,7 @@ class Nursery:
         inner.close()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def __enter__(self) -> "Nursery":
+    def __enter__(self) -> "ForkServer":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -72,13 +72,13 @@ class Nursery:
         """Start what follows `python`; what it writes goes to the descriptor `output`. Started says its pid.
 
         `plan`: a descriptor of the file that the last argument names. The process finds it as PLAN_PATH, so that no
-        folder is needed at a restart. Raises OSError when the nursery has been killed.
+        folder is needed at a restart. Raises OSError when the fork server has been killed.
         """
         descriptors = [output] if plan is None else [output, plan]
         socket.send_fds(self._socket, [msgspec.msgpack.encode(arguments)], descriptors)
 
     def hear(self) -> Started | Ended | None:
-        """Wait for the next word; None: the nursery has ended, and its nodes with it."""
+        """Wait for the next word; None: the fork server has ended, and its nodes with it."""
         try:
             word = self._socket.recv(REQUEST_BYTES)
         except OSError:  # closed here meanwhile
@@ -95,7 +95,7 @@ class Nursery:
 
 
 class _Parent:
-    """The nursery's own end."""
+    """The fork server's own end."""
 
     def __init__(self, inner: socket.socket) -> None:
         self._socket = inner
@@ -104,7 +104,7 @@ class _Parent:
 
     def serve(self) -> None:
         """Start nodes and tell of their ends, until the launcher's end of the socket closes."""
-        setproctitle("caneflow.runtime.hosts.nursery")
+        setproctitle("caneflow.runtime.hosts.launcher.fork_server")
         os.setsid()
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -18,8 +18,8 @@ import psutil
 
 from caneflow.messages import NAME
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.links import UNIX
-from caneflow.runtime.hosts.private_folder import NotOurs, PrivateFolder, folder_of_user
+from caneflow.runtime.hosts.launcher.private_folder import NotOurs, PrivateFolder, folder_of_user
+from caneflow.runtime.hosts.links.session import UNIX
 from caneflow.runtime.wording import shown
 
 ADDRESS = "flow.json"

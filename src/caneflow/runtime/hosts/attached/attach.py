@@ -16,12 +16,12 @@ from caneflow.messages import control_key, sample_key
 from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
 from caneflow.printable import printable
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.links import open_session, sent_at
-from caneflow.runtime.hosts.run_directory import RunningFlow, refused_addresses, running_flows
+from caneflow.runtime.hosts.launcher.run_directory import RunningFlow, refused_addresses, running_flows
+from caneflow.runtime.hosts.links.session import open_session, sent_at
 from caneflow.runtime.wording import did_you_mean, listed
 
 if TYPE_CHECKING:
-    from caneflow.runtime.hosts.certificates import Credentials
+    from caneflow.runtime.hosts.links.certificates import Credentials
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +132,7 @@ def statuses(session: zenoh.Session, flow: str) -> list[FlowStatus]:
 
 def observer_credentials(keys: Path) -> "Credentials | None":
     """An observer's key and certificate in the folder `keys`, else whatever machine's there is; None: none."""
-    from caneflow.runtime.hosts import certificates  # here, as few need them
+    from caneflow.runtime.hosts.links import certificates  # here, as few need them
 
     authority = certificates.AUTHORITY
     names = [path.stem for path in sorted(keys.glob("*.key")) if path.stem != authority]

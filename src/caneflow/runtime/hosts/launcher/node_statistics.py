@@ -74,7 +74,7 @@ class _Cost:
             self.cpu_s, self.at = used, now
 
 
-class Observations:
+class NodeStatistics:
     """Counts and costs of the nodes of one launcher, over the last second or so."""
 
     def __init__(self) -> None:

@@ -21,7 +21,7 @@ import caneflow
 from caneflow.messages import control_key
 from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attach import (
+from caneflow.runtime.hosts.attached.attach import (
     ANSWER_TIMEOUT,
     ANY,
     DEFAULT_KEYS,
@@ -30,8 +30,8 @@ from caneflow.runtime.hosts.attach import (
     observer_credentials,
     timed_statuses,
 )
-from caneflow.runtime.hosts.links import UNIX, open_session
-from caneflow.runtime.hosts.observations import OLD, OTHER_CLOCK
+from caneflow.runtime.hosts.launcher.node_statistics import OLD, OTHER_CLOCK
+from caneflow.runtime.hosts.links.session import UNIX, open_session
 from caneflow.runtime.wording import listed, one_line
 
 DIAL_TIMEOUT = 2.0  # s that a port may take to accept

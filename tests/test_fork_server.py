@@ -13,28 +13,28 @@ import pytest
 
 from tests.flows import CANEFLOW, NODES, node_processes, spread_cane, wait_for, write_walk
 
-# Starts a program from a nursery; prints its pid, all that it wrote, and how it ended.
+# Starts a program from a fork server; prints its pid, all that it wrote, and how it ended.
 START = """
 import json, os, sys
-from caneflow.runtime.hosts import last_words
-from caneflow.runtime.hosts.nursery import Nursery
-nursery = Nursery()
+from caneflow.runtime.hosts.process import last_words
+from caneflow.runtime.hosts.launcher.fork_server import ForkServer
+fork_server = ForkServer()
 reading, writing = os.pipe()
-nursery.start(sys.argv[1:], writing)
+fork_server.start(sys.argv[1:], writing)
 os.close(writing)
-started = nursery.hear()
+started = fork_server.hear()
 wrote = ""
 for line in os.fdopen(reading):  # as the launcher shows them
     words = last_words.heard(line)
     wrote += line if words is None else "\\n".join(words.lines) + "\\n"
-ended = nursery.hear()
-nursery.close()
+ended = fork_server.hear()
+fork_server.close()
 print(json.dumps([started.pid, wrote, ended.pid, ended.status]))
 """
 WITH_A_PLAN = """
 plan = os.memfd_create("plan")
 os.write(plan, b"what is to be done")
-nursery.start(sys.argv[1:], writing, plan)
+fork_server.start(sys.argv[1:], writing, plan)
 """
 SAY = """
 import atexit, json, os, sys, threading
@@ -83,7 +83,7 @@ def test_a_program_finds_itself_as_if_it_had_been_called(
 def test_a_program_finds_its_plan_without_a_folder(tmp_path: Path) -> None:
     file = tmp_path / "program.py"
     file.write_text("import sys\nfrom pathlib import Path\nprint(sys.argv[1], Path(sys.argv[1]).read_text())")
-    with_a_plan = START.replace("nursery.start(sys.argv[1:], writing)", WITH_A_PLAN)
+    with_a_plan = START.replace("fork_server.start(sys.argv[1:], writing)", WITH_A_PLAN)
     command = [sys.executable, "-c", with_a_plan, str(file), str(tmp_path / "nowhere" / "node.json")]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
     assert json.loads(done.stdout)[1] == "/proc/self/fd/3 what is to be done\n"
@@ -118,7 +118,7 @@ def test_what_a_node_started_ends_with_it(started: Callable[..., tuple[str, int]
     wait_for(lambda: not psutil.pid_exists(int(wrote)), "the end of the node's own child")
 
 
-def test_a_killed_nursery_ends_the_run_in_one_line(tmp_path: Path) -> None:
+def test_a_killed_fork_server_ends_the_run_in_one_line(tmp_path: Path) -> None:
     flow = "n" + str(time.time_ns())
     file = tmp_path / "flow.yaml"
     file.write_text(spread_cane(flow, "  here: {}\n", dict.fromkeys(NODES, "here")))
@@ -128,9 +128,9 @@ def test_a_killed_nursery_ends_the_run_in_one_line(tmp_path: Path) -> None:
     )
     wait_for(lambda: len(node_processes(running.pid)) == 4, "all nodes")
     nodes = node_processes(running.pid)
-    nursery = nodes["fusion"].parent()
-    assert nursery is not None
-    nursery.kill()
+    fork_server = nodes["fusion"].parent()
+    assert fork_server is not None
+    fork_server.kill()
     _, said = running.communicate(timeout=60)
     assert running.returncode == 1
     assert "Traceback" not in said

@@ -15,7 +15,7 @@ import zenoh
 from caneflow.messages import MessageError, control_key, decode, encode
 from caneflow.runtime.deployment import Deployment, Site
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.certificates import OBSERVER
+from caneflow.runtime.hosts.links.certificates import OBSERVER
 from caneflow.runtime.wording import listed
 
 # Shared memory does not lead to another machine.

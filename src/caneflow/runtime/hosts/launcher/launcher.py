@@ -25,9 +25,8 @@ from caneflow.runtime.deployment import (
     program_arguments,
     with_recorders_on,
 )
-from caneflow.runtime.hosts import last_words
-from caneflow.runtime.hosts.clocks import Answer, Clocks
-from caneflow.runtime.hosts.congestion import (
+from caneflow.runtime.hosts.launcher.clocks import Answer, Clocks
+from caneflow.runtime.hosts.launcher.congestion import (
     closed_in_time,
     closing_at_once,
     launcher_ids,
@@ -35,9 +34,8 @@ from caneflow.runtime.hosts.congestion import (
     node_ids,
     tool_links,
 )
-from caneflow.runtime.hosts.last_words import LastWords
-from caneflow.runtime.hosts.links import local_links, open_session, protocol
-from caneflow.runtime.hosts.machines import (
+from caneflow.runtime.hosts.launcher.fork_server import ForkServer
+from caneflow.runtime.hosts.launcher.machines import (
     LINK_SETTINGS,
     Began,
     Company,
@@ -47,13 +45,15 @@ from caneflow.runtime.hosts.machines import (
     Left,
     Word,
 )
-from caneflow.runtime.hosts.nursery import Nursery
-from caneflow.runtime.hosts.observations import Observations
-from caneflow.runtime.hosts.private_folder import PrivateFolder
-from caneflow.runtime.hosts.processes import Exited, Line, NurseryLost, Processes
-from caneflow.runtime.hosts.restarts import Again, How, Restarts
-from caneflow.runtime.hosts.run_directory import RunDirectory, remove_state_folder, state_folder
-from caneflow.runtime.hosts.security import links_between, open_door
+from caneflow.runtime.hosts.launcher.node_statistics import NodeStatistics
+from caneflow.runtime.hosts.launcher.private_folder import PrivateFolder
+from caneflow.runtime.hosts.launcher.processes import Exited, ForkServerLost, Line, Processes
+from caneflow.runtime.hosts.launcher.restarts import Again, How, Restarts
+from caneflow.runtime.hosts.launcher.run_directory import RunDirectory, remove_state_folder, state_folder
+from caneflow.runtime.hosts.links.access import links_between, open_door
+from caneflow.runtime.hosts.links.session import local_links, open_session, protocol
+from caneflow.runtime.hosts.process import last_words
+from caneflow.runtime.hosts.process.last_words import LastWords
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.stages.merge import BEGIN, END
 
@@ -159,12 +159,12 @@ class Launcher:
         deployment: Deployment,
         restarts: dict[str, Restart],
         report: Report,
-        nursery: Nursery,
+        fork_server: ForkServer,
         keys: Path | None = None,
     ) -> None:
         """`keys`: the folder with this machine's certificate, where the flow has several machines."""
         self._run = secrets.token_hex(8)  # nobody can guess the ids of its nodes' sessions
-        self._nursery = nursery
+        self._fork_server = fork_server
         self._keys = keys
         self._events: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._restarts = restarts
@@ -183,7 +183,7 @@ class Launcher:
         self._say_window_at = 0.0  # s, monotonic
         self._outcome = Outcome()
         self._state_folder: PrivateFolder | None = None
-        self._observed = Observations()
+        self._statistics = NodeStatistics()
         self._said_removed = False
 
     def run(self) -> Outcome:
@@ -194,7 +194,7 @@ class Launcher:
             closed_in_time(self._open_session(endpoint := ports.endpoint()), [endpoint]) as self._session,
             self._subscribed(),
             self._directory.announced(endpoint),  # tools may attach from here on
-            Processes(self._events, self._nursery) as self._processes,
+            Processes(self._events, self._fork_server) as self._processes,
             self._signals(),
         ):
             if self._directory.remark:
@@ -377,7 +377,7 @@ class Launcher:
             self._open_window()
             if self._clocks is not None:
                 self._clocks.look()
-            self._observed.look(self._nodes.values())
+            self._statistics.look(self._nodes.values())
 
     def _next_events(self) -> Iterator[object]:
         now = time.monotonic()
@@ -398,7 +398,7 @@ class Launcher:
                 self._take_exit(self._nodes[event.node], event)
             case Interrupted():
                 self._outcome.interrupted = True
-            case NurseryLost():
+            case ForkServerLost():
                 self._outcome.failures.append("the process that nodes are started from was killed, and they with it")
             case Said():
                 self._take_said(event)
@@ -411,7 +411,7 @@ class Launcher:
                 here = {name: node for name, node in self._nodes.items() if node.here}
                 deployment = self._deployment
                 machine = deployment.site.name if deployment.site else ""
-                status = self._observed.status(deployment.flow, machine, here, replay=deployment.replay)
+                status = self._statistics.status(deployment.flow, machine, here, replay=deployment.replay)
                 with query:
                     query.reply(query.key_expr, encode(status))
 
@@ -436,12 +436,12 @@ class Launcher:
             self._report(LAUNCHER, f"a {said.kind.__name__} refused: {error}")
             return
         if isinstance(message, Counters):
-            self._observed.note(message)
+            self._statistics.note(message)
         node = self._nodes.get(message.node)
         if node is None:
             return
         if isinstance(message, Counters) and node.here:
-            for line in self._observed.grown_old(message):
+            for line in self._statistics.grown_old(message):
                 self._report(message.node, line)
         if isinstance(message, Progress):
             # A restarted reader begins anew: what it had handled before stands.

@@ -1,0 +1,1 @@
+"""Tools that join a running flow."""

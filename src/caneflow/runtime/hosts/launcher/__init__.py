@@ -1,0 +1,1 @@
+"""Starts the processes of a flow, follows, restarts and ends them."""

@@ -1,0 +1,1 @@
+"""Zenoh sessions, who may do what on them, and certificates."""

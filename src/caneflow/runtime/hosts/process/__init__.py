@@ -1,0 +1,1 @@
+"""One process of a flow: its nodes on one Zenoh session."""
