@@ -25,7 +25,8 @@ from pathlib import Path
 from caneflow.errors import CaneflowError
 from caneflow.recording import Recording, layout, recover
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.deployment import Replay, deploy
+from caneflow.runtime.deployment import deploy
+from caneflow.runtime.replayed import Replay
 
 resource.setrlimit(resource.RLIMIT_CPU, (60, 60))  # s: they take about 6
 layout.MAX_UNPACKED = 2**27  # an eighth, which takes an eighth of the time

@@ -14,9 +14,10 @@ from caneflow.messages import Imu, numbered
 from caneflow.messages.control import Counters, InputCounts
 from caneflow.recording import Recording, RecordingWriter
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.deployment import Replay, deploy
+from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.launcher.launcher import Outcome, note_losses
+from caneflow.runtime.outcome import Outcome, note_losses
+from caneflow.runtime.replayed import Replay
 
 ROOT = Path(__file__).parents[1]
 START, STEP = 10**13, 10_000_000  # ns

@@ -17,10 +17,11 @@ from caneflow.recording import Recording
 from caneflow.runtime import Emitted, Operator
 from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.deployment import Replay, deploy
+from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.program import Program
+from caneflow.runtime.replayed import Replay
 
 clock = time.process_time  # CPU time: other programs on the machine count less
 

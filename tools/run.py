@@ -18,12 +18,14 @@ from caneflow.printable import printable
 from caneflow.recording.parts import Rotation, read_span
 from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.loading import load, read_rig
-from caneflow.runtime.deployment import Deployment, Replay, deploy
+from caneflow.runtime.deployment import Deployment, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.hosts.launcher.fork_server import ForkServer
-from caneflow.runtime.hosts.launcher.launcher import Launcher, Outcome
+from caneflow.runtime.hosts.launcher.launcher import Launcher
 from caneflow.runtime.hosts.launcher.open_files import raise_limit, require_open_files
+from caneflow.runtime.outcome import Outcome
+from caneflow.runtime.replayed import Replay
 from caneflow.runtime.wording import listed
 
 SLOWEST, FASTEST = 1e-3, 1e6  # times real time: 17 min for a second; a year in half a minute, faster than any computer

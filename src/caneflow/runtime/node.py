@@ -20,8 +20,7 @@ import msgspec
 
 from caneflow.messages import MessageError, Sample, decode, numbered
 from caneflow.messages.control import Again, Clock, Counters, PortMark, Progress
-from caneflow.messages.rig import read_rig
-from caneflow.runtime.dataflow.programs import validated_settings
+from caneflow.runtime.building import build
 from caneflow.runtime.hosts.process.bus import (
     Answered,
     Arrived,
@@ -44,13 +43,12 @@ from caneflow.runtime.hosts.process.last_words import telling_failures
 from caneflow.runtime.hosts.process.present import Present
 from caneflow.runtime.hosts.process.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
-from caneflow.runtime.program import Context, Encoded, Operator, Program, Quiet, Sink, Source
+from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.stages.byte_budget import WAITING, weight
 from caneflow.runtime.stages.feed import Feed
 from caneflow.runtime.stages.history import History
 from caneflow.runtime.stages.merge import BEGIN, END
 from caneflow.runtime.stages.references import SnapshotError
-from caneflow.runtime.stages.seeds import generator
 from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
 from caneflow.runtime.stages.stage import Stage
 from caneflow.runtime.stages.streams import AHEAD_KEPT
@@ -89,15 +87,6 @@ def run(program: Program) -> None:
         folder = path.parent if plan.state_folder is None else Path(plan.state_folder)
         _run(program, plan, folder / f"{plan.node}.snapshot")
     sys.exit(0)
-
-
-def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
-    """The program's object with its settings, rig and random numbers, as every host makes it."""
-    settings = validated_settings(program, plan.settings)
-    ports = plan.outputs if issubclass(program, Source) else plan.inputs
-    kinds = {port: wire.kind for port, wire in ports.items()}
-    random = generator(plan.seed, plan.node)
-    return program(settings, Context(node=plan.node, rig=read_rig(plan.rig), ports=kinds, random=random))
 
 
 def _run(program: Program, plan: NodePlan, snapshots: Path) -> None:

@@ -13,12 +13,13 @@ from typing import TypeAlias
 
 from caneflow.messages import MessageError, Sample, decode, encode, with_number
 from caneflow.messages.control import Counters
-from caneflow.runtime.deployment import RECORDER_MODULE, REPLAYER_MODULE, Deployment
+from caneflow.runtime.building import build
+from caneflow.runtime.deployment import RECORDER_MODULE, Deployment
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.launcher.launcher import Outcome, note_losses
-from caneflow.runtime.node import build
+from caneflow.runtime.outcome import Outcome, note_losses
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source
+from caneflow.runtime.replayed import REPLAYER_MODULE
 from caneflow.runtime.stages.feed import Feed
 from caneflow.runtime.stages.stage import Stage
 from caneflow.runtime.stages.tap import Tap

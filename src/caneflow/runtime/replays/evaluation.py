@@ -23,10 +23,11 @@ from caneflow.messages import Pose, Sample
 from caneflow.recording import TRUTH, Recording
 from caneflow.runtime.dataflow.graph import Graph, Node, Queue, Wire
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.deployment import Replay, deploy
+from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.program import Sink
+from caneflow.runtime.replayed import Replay
 from caneflow.runtime.replays.hindsight import HINDSIGHT_OF, SMOOTHED, smoother
 from caneflow.runtime.replays.workers import mapped, mapped_on_cluster
 from caneflow.runtime.wording import did_you_mean, listed, one_line

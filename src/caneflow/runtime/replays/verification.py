@@ -12,11 +12,12 @@ import numpy as np
 from caneflow.messages import MessageError, Sample, decode
 from caneflow.recording import Platform, Recorded, Recording
 from caneflow.runtime.dataflow.graph import Graph
-from caneflow.runtime.deployment import Deployment, Replay, deploy
+from caneflow.runtime.deployment import Deployment, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.plan import InputPlan, NodePlan
 from caneflow.runtime.program import Context, Program, Sink
+from caneflow.runtime.replayed import Replay
 
 # On another platform the last digits differ, and filters carry that on. Measured on a walk of 54 s, x86-64 against
 # aarch64 (qemu-user): speeds 5.4e-7 m/s, Luenberger 2.7e-8 m, `best` 1.7e-7 m, the firmware's model 9.5e-7 m.

@@ -12,10 +12,11 @@ from typing import Any, TypeAlias
 
 from caneflow.messages import MAX_PAYLOAD, control_key, sample_key, stream_of
 from caneflow.runtime.dataflow.topology import is_open
-from caneflow.runtime.deployment import Deployment, Site, recorder_name
+from caneflow.runtime.deployment import Deployment, recorder_name
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links.certificates import OBSERVER, ROUTER, Credentials, credentials
 from caneflow.runtime.hosts.links.session import UNIX
+from caneflow.runtime.site import Site
 
 Grants: TypeAlias = dict[str, list[str]]  # by kind of message the keys
 

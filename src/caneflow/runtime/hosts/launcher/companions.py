@@ -5,6 +5,7 @@ from peer to router to router to peer. (A router does not relay between its own 
 """
 
 import secrets
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -13,9 +14,11 @@ import msgspec
 import zenoh
 
 from caneflow.messages import MessageError, control_key, decode, encode
-from caneflow.runtime.deployment import Deployment, Site
+from caneflow.runtime.deployment import Deployment
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links.certificates import OBSERVER
+from caneflow.runtime.outcome import Outcome
+from caneflow.runtime.site import Site
 from caneflow.runtime.wording import listed
 
 # Shared memory does not lead to another machine.
@@ -60,7 +63,7 @@ Word: TypeAlias = Ended | Failed | Joined | Left | Began
 
 
 @dataclass
-class Company:
+class Companions:
     """The machines of a flow, as one of their launchers sees them."""
 
     site: Site
@@ -69,11 +72,13 @@ class Company:
     run: str = field(default_factory=lambda: secrets.token_hex(4))
     present: dict[str, Joined] = field(default_factory=dict)
     leader_run: str | None = None  # of the leader that this launcher has followed
+    over: bool = False  # the leader has said so
+    alone_since: float | None = None  # s, monotonic: since when the leader is gone
     _held: list[Any] = field(default_factory=list)
 
     @classmethod
-    def of(cls, deployment: Deployment) -> "Company | None":
-        """The company of a deployment that has several machines."""
+    def of(cls, deployment: Deployment) -> "Companions | None":
+        """Those of a deployment that has several machines."""
         if deployment.site is None:
             return None
         return cls(deployment.site, deployment.digest, deployment.records)
@@ -111,6 +116,32 @@ class Company:
         self._held.append(tokens.declare_subscriber(everybody, handler, history=True))
         own = ("machine", self.site.name, self.run, self.digest, "records" if self.records else "listens")
         self._held.append(tokens.declare_token(control_key(flow, *own)))
+
+    def hear(self, word: Ended | Failed | Joined | Left, outcome: Outcome, *, replay: bool) -> str | None:
+        """Take what another machine's launcher says, its failures into `outcome`; what there is to say about it."""
+        match word:
+            case Joined() | Left():
+                said = self.take(word)
+                if word.machine == self.site.leader:
+                    self._take_leader(word, outcome, replay=replay)
+                return said
+            case Ended(failures, interrupted):
+                self.over = True
+                outcome.failures += [f"{self.site.leader}: {failure}" for failure in failures]
+                outcome.interrupted = outcome.interrupted or interrupted
+            case Failed(machine, failures):
+                outcome.failures += [f"{machine}: {failure}" for failure in failures]
+        return None
+
+    def _take_leader(self, word: Joined | Left, outcome: Outcome, *, replay: bool) -> None:
+        leader = self.site.leader
+        self.alone_since = None if leader in self.present else time.monotonic()
+        if isinstance(word, Joined) and self.leader_run is None:
+            self.leader_run = word.run
+        elif isinstance(word, Joined) and self.leader_run != word.run:
+            self.leader_run = word.run
+            if replay:
+                outcome.failures.append(f"{leader} has begun another replay; this part belongs to the one before")
 
     def take(self, word: Joined | Left) -> str | None:
         """Note who came or went; what there is to say about it."""
@@ -155,7 +186,13 @@ class Company:
         missing = self.missing
         return tuple(node for node in nodes if self.site.places.get(node) in missing)
 
-    def tell(self, session: zenoh.Session, flow: str, word: Ended | Failed) -> None:
-        """Tell the others how this machine's part has ended."""
+    def part(self, session: zenoh.Session, flow: str, outcome: Outcome) -> None:
+        """Tell the other machines that it is over, for all or for this one."""
+        if self.site.leads:
+            self._tell(session, flow, Ended(outcome.failures, outcome.interrupted))
+        elif outcome.failures and not self.over:
+            self._tell(session, flow, Failed(self.site.name, outcome.failures))
+
+    def _tell(self, session: zenoh.Session, flow: str, word: Ended | Failed) -> None:
         key = control_key(flow, "end") if isinstance(word, Ended) else control_key(flow, "failed", word.machine)
         session.put(key, encode(word), congestion_control=zenoh.CongestionControl.BLOCK)

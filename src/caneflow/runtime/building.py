@@ -1,0 +1,16 @@
+"""From a plan to the program's object, the same way on every host."""
+
+from caneflow.messages.rig import read_rig
+from caneflow.runtime.dataflow.programs import validated_settings
+from caneflow.runtime.plan import NodePlan
+from caneflow.runtime.program import Context, Operator, Program, Sink, Source
+from caneflow.runtime.stages.seeds import generator
+
+
+def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
+    """The program's object with its settings, rig and random numbers, as every host makes it."""
+    settings = validated_settings(program, plan.settings)
+    ports = plan.outputs if issubclass(program, Source) else plan.inputs
+    kinds = {port: wire.kind for port, wire in ports.items()}
+    random = generator(plan.seed, plan.node)
+    return program(settings, Context(node=plan.node, rig=read_rig(plan.rig), ports=kinds, random=random))

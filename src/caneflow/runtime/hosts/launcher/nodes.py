@@ -1,0 +1,139 @@
+"""The nodes of a run as their launcher follows them: what they say, whether all are ready, whether all have ended."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from caneflow.messages import MessageError, decode
+from caneflow.messages.control import Counters, FlowStatus, Progress
+from caneflow.runtime.dataflow.graph import Restart
+from caneflow.runtime.deployment import RECORDER_MODULE, Deployment
+from caneflow.runtime.hosts.launcher.ends import LIVE_RECORDER_RESTART, RECORDER_RESTART
+from caneflow.runtime.hosts.launcher.hearing import Said
+from caneflow.runtime.hosts.launcher.node_state import NodeState
+from caneflow.runtime.hosts.launcher.node_statistics import NodeStatistics
+from caneflow.runtime.hosts.launcher.restarts import Restarts
+from caneflow.runtime.stages.merge import END
+
+LAUNCHER = "caneflow"  # the launcher's name in the merged log
+
+Report = Callable[[str, str], None]  # (node, line)
+
+
+class Nodes:
+    """Those that start here; at the leader those of all machines."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        self._nodes: dict[str, NodeState] = {}
+        self._statistics = NodeStatistics()
+
+    def take(self, deployment: Deployment, restarts: Mapping[str, Restart], *, leads: bool) -> None:
+        """Know the nodes of `deployment`, each with its restart policy."""
+        for name, plan in deployment.plans.items():
+            here = deployment.runs_here(name)
+            if leads or here:
+                recorder = RECORDER_RESTART if deployment.replay else LIVE_RECORDER_RESTART
+                policy = Restarts(restarts.get(name, recorder), replay=deployment.replay)
+                spare = plan.module == RECORDER_MODULE and not deployment.replay
+                self._nodes[name] = NodeState(plan, policy, spare=spare, here=here)
+
+    def __getitem__(self, name: str) -> NodeState:
+        return self._nodes[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._nodes
+
+    def __iter__(self) -> Iterator[NodeState]:
+        return iter(self._nodes.values())
+
+    @property
+    def here(self) -> list[NodeState]:
+        """Those that this launcher starts."""
+        return [node for node in self if node.here]
+
+    @property
+    def spares(self) -> list[str]:
+        """Those that a live flow goes on without."""
+        return [node.plan.node for node in self if node.spare]
+
+    @property
+    def all_ready(self) -> bool:
+        """Whether all can begin; nobody waits for a spare node that is on another machine, or has failed."""
+        return all(
+            node.state == "ready" or (node.spare and (not node.here or node.failing_since is not None)) for node in self
+        )
+
+    @property
+    def all_ended(self) -> bool:
+        """Whether everything has been handled."""
+        return all(node.handled == END or node.missing for node in self)
+
+    @property
+    def handled(self) -> Iterator[int]:
+        """Up to which stamp (ns) each reader has handled everything."""
+        return (node.handled for node in self if node.plan.inputs)
+
+    @property
+    def kinds(self) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
+        """The names of sources, operators and sinks."""
+        sources = [node.plan.node for node in self if not node.plan.inputs]
+        sinks = [node.plan.node for node in self if node.plan.inputs and not node.plan.outputs]
+        operators = [node.plan.node for node in self if node.plan.inputs and node.plan.outputs]
+        return sources, operators, sinks
+
+    @property
+    def counters(self) -> dict[str, Counters]:
+        """The last that each said it counted."""
+        return {node.plan.node: node.counters for node in self if node.counters is not None}
+
+    def take_line(self, name: str, text: str) -> None:
+        """Report a line that a node wrote."""
+        for line in self[name].take_line(text):
+            self._report(name, line)
+
+    def take_said(self, said: Said) -> None:
+        """Note what a node says of its progress, or of what it counted."""
+        try:
+            message = decode(said.payload, said.kind)
+        except MessageError as error:
+            self._report(LAUNCHER, f"a {said.kind.__name__} refused: {error}")
+            return
+        if isinstance(message, Counters):
+            self._statistics.note(message)
+        node = self._nodes.get(message.node)
+        if node is None:
+            return
+        if isinstance(message, Progress):
+            # A restarted reader begins anew: what it had handled before stands.
+            node.handled = max(node.handled, message.handled)
+            return
+        if node.here:
+            for line in self._statistics.grown_old(message):
+                self._report(message.node, line)
+        node.counters = message
+        if message.ended:
+            node.handled = END
+
+    def take_ready(self, name: str, *, there: bool) -> None:
+        """Note that a node hears and is heard; not `there`: that it is out of reach."""
+        node = self[name]
+        if not there:
+            if not node.here:  # the end of a process of this machine is told by the process
+                node.state = "away"
+            return
+        node.state = "ready"
+        now = time.monotonic()
+        node.policy.ready(now)
+        if node.failing_since is not None:
+            self._report(name, f"is there again, after {now - node.failing_since:.1f} s")
+            node.failing_since = None
+
+    def look(self) -> None:
+        """See what each process costs, once a second."""
+        self._statistics.look(self)
+
+    def status(self, deployment: Deployment) -> FlowStatus:
+        """Everything that is known of those here, now."""
+        here = {node.plan.node: node for node in self.here}
+        machine = deployment.site.name if deployment.site else ""
+        return self._statistics.status(deployment.flow, machine, here, replay=deployment.replay)

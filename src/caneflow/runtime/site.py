@@ -1,0 +1,67 @@
+"""The machine that a launcher runs on, among those of its flow."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from caneflow.runtime.dataflow.graph import Graph, Node
+from caneflow.runtime.errors import DataflowError
+from caneflow.runtime.wording import did_you_mean, listed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Site:
+    """The machine that a launcher runs on, among those of its flow."""
+
+    name: str
+    leader: str  # the machine whose launcher says when all start and end
+    others: tuple[str, ...]
+    places: Mapping[str, str]  # by node the machine that it runs on
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    router: str | None = None  # an endpoint that all machines dial; None: they dial each other
+    recorders: frozenset[str] = frozenset()  # the machines that may read every stream
+    insecure: bool = False  # the file says that machines talk in the clear
+
+    @property
+    def leads(self) -> bool:
+        """Whether this machine's launcher leads."""
+        return self.name == self.leader
+
+
+def site_of(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | None:
+    """The place of `machine` in the graph; None when it is the only one."""
+    if machine not in graph.machines:
+        raise DataflowError(
+            f"--machine {machine}: no such machine;{did_you_mean(machine, graph.machines)} "
+            f"there are {listed(graph.machines)}"
+        )
+    places = {name: str(node.machine) for name, node in nodes.items()}
+    used = [name for name in graph.machines if name in places.values()]
+    if machine not in used:
+        raise DataflowError(f"--machine {machine}: no node runs there")
+    if len(used) == 1:
+        return None
+    leader = graph.leader if graph.leader in used else used[0]
+    assert leader is not None
+    written = graph.machines[machine]
+    return Site(
+        name=machine,
+        leader=leader,
+        others=tuple(name for name in used if name in written.linked),
+        places=places,
+        listen=written.listen,
+        connect=(*written.connect, *filter(None, (graph.router,))),
+        router=graph.router,
+        recorders=frozenset(name for name in used if graph.machines[name].records),
+        insecure=graph.insecure,
+    )
+
+
+def door_of(graph: Graph) -> Site | None:
+    """Where the only machine of the graph listens for others; None: nowhere."""
+    used = list({node.machine: None for node in graph.nodes.values()})
+    if len(used) != 1 or used[0] is None or not graph.machines[used[0]].listen:
+        return None
+    name, places = used[0], dict.fromkeys(graph.nodes, used[0])
+    listen = graph.machines[name].listen
+    return Site(name=name, leader=name, others=(), places=places, listen=listen, connect=(), insecure=graph.insecure)
