@@ -61,6 +61,10 @@ def command(
         Path | None,
         typer.Option(metavar="DIR", help="with --machine: this machine's certificate [default: keys, beside the file]"),
     ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(metavar="tcp/HOST:PORT", help="let other programs attach here, beside where the file says"),
+    ] = None,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -119,6 +123,7 @@ def command(
             recorder=recorder,
             rig=_rig(rig),
             machine=None if in_process else machine,
+            listen=_listen(listen, in_process=in_process),
         )
         if fork_server is not None:
             require_open_files(sum(map(deployment.runs_here, deployment.plans)))
@@ -199,6 +204,12 @@ def _recorder(
         return {}
     rotation = Rotation.read(rotate, keep)
     return {"rotate_bytes": rotation.size, "rotate_s": rotation.span_s, "keep": rotation.keep}
+
+
+def _listen(endpoint: str | None, *, in_process: bool) -> str | None:
+    if endpoint is not None and in_process:
+        raise DataflowError("--listen: nobody can attach to a flow in one process; leave --in-process out")
+    return endpoint
 
 
 def _check_machine(graph: Graph, machine: str | None, *, everything_here: bool) -> None:

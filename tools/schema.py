@@ -7,6 +7,7 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, json_schema
+from caneflow.messages.control import FlowStatus
 
 DATAFLOW = "dataflow"  # the one schema that is not a message's
 
@@ -39,6 +40,8 @@ def schema_of(name: str) -> dict[str, Any]:
         from caneflow.runtime.dataflow.yaml_shape import yaml_schema  # here, as a message's schema needs no runtime
 
         return yaml_schema()
+    if name in ("FlowStatus", "caneflow.FlowStatus/1"):
+        return json_schema(FlowStatus)
     known = schemas()
     for full_name, schema in known.items():
         if name in (full_name, full_name.removeprefix("caneflow.").partition("/")[0]):

@@ -25,6 +25,9 @@ def command(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object; times in s, memory in bytes.")
     ] = False,
+    endpoint: Annotated[
+        bool, typer.Option("--endpoint", help="Print only where other programs attach, for scripts.")
+    ] = False,
 ) -> None:
     """Show the nodes and edges of a running flow: rates, delays, and how many samples were lost where.
 
@@ -37,7 +40,9 @@ def command(
     """
     with attached(flow, at, keys) as here:
         status = here.status()
-    if as_json:
+    if endpoint:
+        print(status.endpoint)
+    elif as_json:
         print(json.dumps(plain(status), indent=2))
     else:
         print("\n".join(lines(status)))
@@ -56,6 +61,7 @@ def lines(status: FlowStatus) -> Iterator[str]:
     """The same for people."""
     kind = "replay" if status.replay else "live"
     yield f"{status.flow}: {kind}, on {status.host}, caneflow {status.version}, up {_span(status.uptime)}"
+    yield f"other programs attach at {status.endpoint}"
     yield ""
     head: tuple[str, ...] = ("node", "state", "pid", "up", "cpu", "memory", "restarts", "sent")
     rows = [head, *(_node(node) for node in status.nodes)]

@@ -156,3 +156,4 @@ class FlowStatus(msgspec.Struct, frozen=True, kw_only=True):
     nodes: list[NodeStatus]
     edges: list[EdgeStatus]
     rig: dict[str, Any] = {}  # that its nodes were given
+    endpoint: str = ""  # where other programs attach: the first that the flow listens at for them, else its own socket

@@ -14,6 +14,7 @@ from caneflow.messages import MessageError, sample_key
 from caneflow.messages.rig import overlaid, read_rig
 from caneflow.recording import TRUTH, Recording
 from caneflow.runtime.dataflow.graph import Graph, Node
+from caneflow.runtime.dataflow.topology import NOBODY_LISTENS
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, NodePlan
 from caneflow.runtime.replayed import (
@@ -26,7 +27,7 @@ from caneflow.runtime.replayed import (
     replayed_plan,
     require_stamps,
 )
-from caneflow.runtime.site import Site, door_of, site_of
+from caneflow.runtime.site import Site, door_of, site_of, with_endpoint
 from caneflow.runtime.stages.byte_budget import SENT, share
 
 RECORDER = "recorder"
@@ -84,11 +85,12 @@ def deploy(
     recorder: Mapping[str, Any] | None = None,
     rig: dict[str, Any] | None = None,
     machine: str | None = None,
+    listen: str | None = None,
 ) -> Deployment:
     """The plans of one run; raises DataflowError when the recording does not fit the graph.
 
     `recorder`: its settings beyond where it writes. `machine`: this launcher starts only what runs there; None:
-    everything.
+    everything. `listen`: an endpoint at which other programs may attach, beside those of the file.
     """
     if replay and record and record.exists() and record.samefile(replay.recording):
         raise DataflowError(f"--record {record}: is the recording that is replayed; write to another file")
@@ -122,8 +124,19 @@ def deploy(
         plans[name] = msgspec.structs.replace(plan, settings={**plan.settings, **(recorder or {})})
         site = _with_recorder_on(site, machine) if site and machine else site
     plans = {name: _with_readers(plan, plans, whole_rig, replay is not None) for name, plan in plans.items()}
-    door = door_of(graph) if site is None and (machine is not None or replay is None) else None
+    if site is not None:
+        site = with_endpoint(site, listen)
+    opens = site is None and (machine is not None or replay is None or listen is not None)
+    door = door_of(graph, listen) if opens else None
+    _require_open(graph, plans, site or door)
     return Deployment(flow=graph.flow, plans=plans, origin=origin, site=site, door=door, links=graph.links)
+
+
+def _require_open(graph: Graph, plans: Mapping[str, NodePlan], here: Site | None) -> None:
+    """Raise DataflowError when a program of somebody else's is part of the flow here and nobody listens for it."""
+    for name, plan in plans.items():
+        if plan.external and (here is None or (here.places.get(name, here.name) == here.name and not here.listen)):
+            raise DataflowError(f"{graph.path}: nodes.{name}: {NOBODY_LISTENS}")
 
 
 def with_recorders_on(deployment: Deployment, machines: Iterable[str]) -> Deployment:
@@ -231,7 +244,9 @@ def _with_readers(plan: NodePlan, plans: dict[str, NodePlan], rig: dict[str, Any
             out, readers=names, awaited=awaited, budget=_budget(out.key, plan, plans)
         )
     inputs = {
-        port: msgspec.structs.replace(wire, budget=_budget(wire.key, plans[wire.writer], plans))
+        port: msgspec.structs.replace(
+            wire, budget=_budget(wire.key, plans[wire.writer], plans), external=plans[wire.writer].external
+        )
         for port, wire in plan.inputs.items()
     }
     if replay:  # nothing may be lost, and nobody has a clock to lag behind: the sources wait instead

@@ -170,7 +170,8 @@ class _ReaderNode(ABC):
         self._missing: dict[str, _Missing] = {}
         # Each writer is asked at the start what it has sent so far, until it answers: a node that is started anew may
         # have missed its last word, and the link to the writer may not be there yet.
-        self._unanswered = dict.fromkeys(plan.inputs, 0.0)  # s, monotonic: when to ask next
+        asked = [port for port, wire in plan.inputs.items() if not wire.external]
+        self._unanswered = dict.fromkeys(asked, 0.0)  # s, monotonic: when to ask next
         self._asking: set[str] = set()  # ports whose writer is being asked: what it answers may wait to be looked at
         self._dropped = dict.fromkeys(plan.inputs, 0)  # unseen, as was counted
         reader.bound(WAITING)
@@ -182,7 +183,7 @@ class _ReaderNode(ABC):
         self._came = False  # anything, at once, since this was last looked at
         self._broken: BaseException | None = None  # what was raised at once: the node handles and keeps nothing more
         for port, arrivals in reader.inputs.items():
-            arrivals.patient = True
+            arrivals.patient = not plan.inputs[port].external
             arrivals.clock_offset = None if plan.inputs[port].clock else 0
 
     def at(self) -> str | None:

@@ -23,6 +23,7 @@ class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     max_age_ms: float | None = None  # live: older samples are dropped. None: never
     left_out: tuple[int, ...] = ()  # stamps (ns) of samples that the recorded live run did not handle
     budget: int = SENT  # bytes that its writer may keep of it
+    external: bool = False  # its writer is a program of somebody else's: it comes and goes, and cannot be asked
 
     @cached_property
     def kind(self) -> type[Sample]:
@@ -78,6 +79,11 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
     takes_over: bool = False  # in the place of a process that ended: what that one had taken is not missing
     state_folder: str | None = None  # where snapshots are kept; None: beside the plan
     ready_timeout_s: float = 20.0
+
+    @property
+    def external(self) -> bool:
+        """Whether it is a program of somebody else's, which no launcher starts."""
+        return self.module is None and self.file is None
 
     @property
     def readers(self) -> tuple[str, ...]:

@@ -1,9 +1,11 @@
 """The machine that a launcher runs on, among those of its flow."""
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from caneflow.runtime.dataflow.graph import Graph, Node
+from caneflow.runtime.dataflow.yaml_shape import ENDPOINT_PATTERN
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.wording import did_you_mean, listed
 
@@ -57,11 +59,23 @@ def site_of(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | Non
     )
 
 
-def door_of(graph: Graph) -> Site | None:
-    """Where the only machine of the graph listens for others; None: nowhere."""
+def door_of(graph: Graph, listen: str | None) -> Site | None:
+    """Where the only machine of the graph, and `listen`, let other programs in; None: nowhere."""
     used = list({node.machine: None for node in graph.nodes.values()})
-    if len(used) != 1 or used[0] is None or not graph.machines[used[0]].listen:
+    if len(used) != 1:
         return None
-    name, places = used[0], dict.fromkeys(graph.nodes, used[0])
-    listen = graph.machines[name].listen
-    return Site(name=name, leader=name, others=(), places=places, listen=listen, connect=(), insecure=graph.insecure)
+    name = used[0] or ""
+    written = graph.machines[name].listen if name else ()
+    places = dict.fromkeys(graph.nodes, name)
+    site = Site(name=name, leader=name, others=(), places=places, listen=written, connect=(), insecure=graph.insecure)
+    site = with_endpoint(site, listen)
+    return site if site.listen else None
+
+
+def with_endpoint(site: Site, listen: str | None) -> Site:
+    """The same, listening at `listen` as well; raises DataflowError when that is no endpoint."""
+    if listen is None:
+        return site
+    if not re.fullmatch(ENDPOINT_PATTERN, listen):
+        raise DataflowError(f"--listen {listen}: is no endpoint; write tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447")
+    return replace(site, listen=tuple(dict.fromkeys([*site.listen, listen])))

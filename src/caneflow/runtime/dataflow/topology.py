@@ -15,6 +15,10 @@ from caneflow.runtime.wording import did_you_mean, listed
 
 EVERYWHERE = {"0.0.0.0", "[::]"}  # noqa: S104 - compared with, not bound to
 HIGHEST_PORT = 65535
+NOBODY_LISTENS = (
+    "is a program of somebody else's, and this machine does not listen for it; "
+    "write e.g. machines: {here: {listen: [tcp/127.0.0.1:7447]}}, or give --listen tcp/127.0.0.1:7447"
+)
 RESERVED = {"ca", "observer", "router"}  # names among the keys of a flow
 
 
@@ -59,6 +63,10 @@ def check_machines(document: Document, flow: FlowShape, parts: Mapping[str, Part
             document.problem(("machines", machine), "is taken by caneflow; call it otherwise", key=True)
         if machine not in places.values():
             document.problem(("machines", machine), "no node runs here", key=True, warning=True)
+    for name, part in parts.items():
+        at = flow.machines.get(places[name] or "")
+        if part.shape.external and not (at and at.listen):
+            document.problem(("nodes", name), NOBODY_LISTENS, key=True, warning=True)
     used = [machine for machine in flow.machines if machine in places.values()]
     leader = _leader(used, reached)
     if len(used) > 1 and leader is None and not dead:

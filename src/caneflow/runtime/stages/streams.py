@@ -104,6 +104,8 @@ class Arrivals:
             self.take_next(message)
             return [message]
         self.counts.received += 1
+        if self.plan.external and self.last_stamp == BEGIN:
+            self.expected = message.seq  # it was there before: what it said to others is not lost
         if message.seq == self.other and not again and self.expected - self.other_since <= SECOND_WRITER:
             self._change_writer()
         if message.stamp <= self.last_stamp or message.seq in self.ahead:

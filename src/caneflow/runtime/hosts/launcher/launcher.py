@@ -9,7 +9,7 @@ from pathlib import Path
 
 import zenoh
 
-from caneflow.messages import control_key, encode
+from caneflow.messages import MEDIA_TYPE, control_key, encode
 from caneflow.messages.control import Window
 from caneflow.runtime.dataflow.graph import Restart
 from caneflow.runtime.deployment import Deployment, with_recorders_on
@@ -19,7 +19,7 @@ from caneflow.runtime.hosts.launcher.congestion import closed_in_time
 from caneflow.runtime.hosts.launcher.ends import Ends
 from caneflow.runtime.hosts.launcher.fork_server import ForkServer
 from caneflow.runtime.hosts.launcher.hearing import Ready, Said, StatusAsked, hearing
-from caneflow.runtime.hosts.launcher.launcher_session import open_launcher_session
+from caneflow.runtime.hosts.launcher.launcher_session import listening, open_launcher_session
 from caneflow.runtime.hosts.launcher.linking import linked
 from caneflow.runtime.hosts.launcher.node_state import NodeState
 from caneflow.runtime.hosts.launcher.nodes import LAUNCHER, Nodes, Report
@@ -37,6 +37,7 @@ from caneflow.runtime.stages.merge import BEGIN
 STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them: 5 s in all
 LEADER_PATIENCE = 120.0  # s that the part of a replay waits for its leader to come back
 WAITING_SAID = 10.0  # s after which a launcher says again whom it waits for
+STATUS = "caneflow.FlowStatus/1"
 WAKE_PERIOD = 0.2  # s between two looks at deadlines
 
 
@@ -70,6 +71,7 @@ class Launcher:
         self._ends = Ends(report, self._outcome)
         self._state_folder: PrivateFolder | None = None
         self._said_removed = False
+        self._endpoint = ""  # where it listens for its nodes
 
     def run(self) -> Outcome:
         """Start everything, follow it to its end, end everything."""
@@ -85,8 +87,11 @@ class Launcher:
             Processes(self._events, self._fork_server) as self._processes,
             stop_signals(self._events.put),
         ):
+            self._endpoint = endpoint
             if self._directory.remark:
                 self._report(LAUNCHER, f"{self._directory.remark}; this run is in {self._directory.path}")
+            if deployment.door is not None:
+                self._report(LAUNCHER, listening(deployment.door))
             if self._gather():
                 self._take_nodes(linked(self._deployment, ports, endpoint))
                 for node in self._nodes.here:
@@ -199,7 +204,11 @@ class Launcher:
                     self._report(LAUNCHER, said)
             case StatusAsked(query):
                 with query:
-                    query.reply(query.key_expr, encode(self._nodes.status(self._deployment)))
+                    query.reply(
+                        control_key(self._deployment.flow, "status"),
+                        encode(self._nodes.status(self._deployment, self._endpoint)),
+                        encoding=zenoh.Encoding(MEDIA_TYPE).with_schema(STATUS),
+                    )
 
     def _begin_if_all_are_ready(self) -> None:
         if self._started_s is None and self._leads and self._nodes.all_ready:

@@ -21,6 +21,9 @@ TOO_SLOW = "this machine or the link is too slow (`caneflow top`), and positions
 OTHER_CLOCK = 3600.0  # s of age above which stamps are taken for those of another clock
 
 
+SILENT = "nothing was heard of it yet"  # of an external node
+
+
 class ObservedNode(Protocol):
     """What the launcher knows of a node and is told here."""
 
@@ -121,7 +124,9 @@ class NodeStatistics:
         for cost in self._costs.values():
             cost.look(now)
 
-    def status(self, flow: str, machine: str, nodes: Mapping[str, ObservedNode], *, replay: bool) -> FlowStatus:
+    def status(
+        self, flow: str, machine: str, nodes: Mapping[str, ObservedNode], *, replay: bool, endpoint: str
+    ) -> FlowStatus:
         """Everything, now."""
         now = time.monotonic()
         return FlowStatus(
@@ -133,33 +138,56 @@ class NodeStatistics:
             replay=replay,
             clock=time.time_ns(),
             machine=machine,
-            nodes=[self._node(name, node, now, machine) for name, node in nodes.items()],
+            nodes=[self._node(name, node, now, machine, nodes) for name, node in nodes.items()],
             edges=[edge for name, node in nodes.items() for edge in self._edges(name, node)],
             rig=next((node.plan.rig for node in nodes.values()), {}),
+            endpoint=endpoint,
         )
 
-    def _node(self, name: str, node: ObservedNode, now: float, machine: str) -> NodeStatus:
+    def _node(
+        self, name: str, node: ObservedNode, now: float, machine: str, nodes: Mapping[str, ObservedNode]
+    ) -> NodeStatus:
         counted, cost = self._counted.get(name), self._costs.get(node.pid)
-        sent = counted.now.outputs if counted else {}
+        sent = dict(counted.now.outputs) if counted else {}
+        rates = {port: self._sent_rate(name, port) for port in node.plan.outputs}
+        said = node.last_line
+        if node.plan.external:  # it counts nothing for us: what its readers heard
+            sent, rates = self._heard_of(node, nodes)
+            said = said or ("" if any(sent.values()) else SILENT)
         return NodeStatus(
             node=name,
             program=node.plan.file or node.plan.module or "",
             state=node.state,
             pid=node.pid,
             restarts=node.restarts,
-            uptime=now - node.started_at,
+            uptime=now - (node.started_at or self._since),
             cpu=cost.cpu if cost else None,
             memory=cost.memory if cost else None,
             sent={port: sent.get(port, 0) for port in node.plan.outputs},
-            rates={port: self._sent_rate(name, port) for port in node.plan.outputs},
+            rates=rates,
             counted=now - counted.at if counted else None,
-            said=node.last_line,
+            said=said,
             machine=machine,
             listen=node.plan.links.listen,
             connect=node.plan.links.connect,
             held=counted.now.held if counted else 0,
             let_go=counted.now.let_go if counted else 0,
         )
+
+    def _heard_of(
+        self, node: ObservedNode, nodes: Mapping[str, ObservedNode]
+    ) -> tuple[dict[str, int], dict[str, float | None]]:
+        """By output port of an external node how many samples a reader knows of, and at which rate (Hz) it got them."""
+        sent, rates = dict.fromkeys(node.plan.outputs, 0), dict[str, float | None].fromkeys(node.plan.outputs)
+        for port, out in node.plan.outputs.items():
+            for reader, other in nodes.items():
+                for own, wire in other.plan.inputs.items():
+                    counted = self._counted.get(reader)
+                    if wire.key == out.key and counted is not None:
+                        counts = counted.now.inputs.get(own, InputCounts())
+                        sent[port] = max(sent[port], counts.received + counts.lost)
+                        rates[port] = self._received_rate(reader, own) or rates[port]
+        return sent, rates
 
     def _edges(self, name: str, node: ObservedNode) -> Iterable[EdgeStatus]:
         counted = self._counted.get(name)

@@ -35,7 +35,8 @@ class Nodes:
                 recorder = RECORDER_RESTART if deployment.replay else LIVE_RECORDER_RESTART
                 policy = Restarts(restarts.get(name, recorder), replay=deployment.replay)
                 spare = plan.module == RECORDER_MODULE and not deployment.replay
-                self._nodes[name] = NodeState(plan, policy, spare=spare, here=here)
+                state = "external" if plan.external else "starting"
+                self._nodes[name] = NodeState(plan, policy, spare=spare, here=here, state=state)
 
     def __getitem__(self, name: str) -> NodeState:
         return self._nodes[name]
@@ -49,7 +50,7 @@ class Nodes:
     @property
     def here(self) -> list[NodeState]:
         """Those that this launcher starts."""
-        return [node for node in self if node.here]
+        return [node for node in self if node.here and not node.plan.external]
 
     @property
     def spares(self) -> list[str]:
@@ -58,9 +59,10 @@ class Nodes:
 
     @property
     def all_ready(self) -> bool:
-        """Whether all can begin; nobody waits for a spare node that is on another machine, or has failed."""
+        """Whether all can begin; nobody waits for an external one, or a spare one that is elsewhere or has failed."""
         return all(
-            node.state == "ready" or (node.spare and (not node.here or node.failing_since is not None)) for node in self
+            node.state in ("ready", "external") or (node.spare and (not node.here or node.failing_since is not None))
+            for node in self
         )
 
     @property
@@ -75,8 +77,8 @@ class Nodes:
 
     @property
     def kinds(self) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
-        """The names of sources, operators and sinks."""
-        sources = [node.plan.node for node in self if not node.plan.inputs]
+        """The names of sources, operators and sinks, but for external nodes."""
+        sources = [node.plan.node for node in self if not (node.plan.inputs or node.plan.external)]
         sinks = [node.plan.node for node in self if node.plan.inputs and not node.plan.outputs]
         operators = [node.plan.node for node in self if node.plan.inputs and node.plan.outputs]
         return sources, operators, sinks
@@ -132,8 +134,10 @@ class Nodes:
         """See what each process costs, once a second."""
         self._statistics.look(self)
 
-    def status(self, deployment: Deployment) -> FlowStatus:
-        """Everything that is known of those here, now."""
-        here = {node.plan.node: node for node in self.here}
+    def status(self, deployment: Deployment, endpoint: str) -> FlowStatus:
+        """Everything that is known of those here, now; `endpoint`: where their launcher listens for them."""
+        here = {node.plan.node: node for node in self if node.here}
         machine = deployment.site.name if deployment.site else ""
-        return self._statistics.status(deployment.flow, machine, here, replay=deployment.replay)
+        site = deployment.site or deployment.door
+        at = site.listen[0] if site and site.listen else endpoint
+        return self._statistics.status(deployment.flow, machine, here, replay=deployment.replay, endpoint=at)

@@ -84,7 +84,7 @@ def open_door(deployment: Deployment, keys: Path | None) -> tuple[tuple[str, ...
     site = deployment.door
     if site is None:
         return (), {}
-    own = None if site.insecure or keys is None else credentials(keys, site.name)
+    own = None if site.insecure or keys is None or not site.name else credentials(keys, site.name)
     if own is not None:
         return tuple(map(tls, site.listen)), secured_links(deployment, site, own)
     _require_keys(site, keys)
@@ -97,6 +97,11 @@ def _require_keys(site: Site, keys: Path | None) -> None:
     """Raise DataflowError when a link would lead beyond this computer in the clear, and the file does not say so."""
     beyond = [endpoint for endpoint in (*site.listen, *site.connect) if is_open(endpoint)]
     if beyond and not site.insecure:
+        if not site.name:
+            raise DataflowError(
+                f"{beyond[0]}: leads beyond this computer, and this flow has no keys; name the machine in the file "
+                "(machines: {here: {listen: [...]}}) and make its keys, or write `insecure: true`"
+            )
         raise DataflowError(
             f"{site.name}: no keys for {beyond[0]} in {keys}; `caneflow keys init` and `caneflow keys add {site.name}` "
             "make them (or write `insecure: true` for a network that only you are in)"
@@ -118,7 +123,9 @@ def access_control(deployment: Deployment, site: Site) -> dict[str, Any]:
     everything = dict.fromkeys(KINDS, _everything("*"))
     _allow(control, "this machine", {"link_protocols": [LOCAL[deployment.links]]}, everything, everything)
     if deployment.links != "tcp":  # where it is not the flow's own, who comes by it is nobody in particular
-        _allow(control, "anybody by TCP", {"link_protocols": ["tcp"]}, *both_ways[OBSERVER])
+        _allow(control, "anybody by TCP", {"link_protocols": ["tcp"]}, *feeder_grants(deployment, site))
+    if site.name:  # who shows this machine's own certificate is one of its programs
+        _allow(control, site.name, {"cert_common_names": [site.name]}, *feeder_grants(deployment, site))
     return control
 
 
@@ -198,6 +205,19 @@ def observer_grants(flow: str) -> tuple[Grants, Grants]:
         "liveliness_token": everything,
     }
     return asks, gets
+
+
+def feeder_grants(deployment: Deployment, site: Site) -> tuple[Grants, Grants]:
+    """An observer's rights, and to write what the external nodes of this machine do."""
+    asks, gets = observer_grants(deployment.flow)
+    external = [name for name, plan in deployment.plans.items() if plan.external and _is_at(site, name)]
+    written = [sample_key(deployment.flow, name, port) for name in external for port in deployment.plans[name].outputs]
+    # That somebody reads these keys is told to who writes them: without, a publisher sends nothing.
+    return _together([asks, {"put": written}]), _together([gets, {"declare_subscriber": written}])
+
+
+def _is_at(site: Site, node: str) -> bool:
+    return site.places.get(node, site.name) == site.name
 
 
 def observed_grants(deployment: Deployment, site: Site, machine: str) -> Grants:
