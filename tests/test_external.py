@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -169,3 +170,22 @@ def test_a_port_that_is_taken_is_one_line_before_anything_starts(
     assert run.returncode == 2
     assert at in run.stderr.splitlines()[-1]
     assert "Traceback" not in run.stderr
+
+
+def test_the_examples_of_the_page_feed_and_hear(launch: Callable[..., Launched], tmp_path: Path) -> None:
+    running, flow, at = began(launch, tmp_path)
+    with client(at) as session:
+        wait_for(lambda: {n.state for n in status(session, flow).nodes} == {"external", "ready"}, "the others")
+    examples = Path(__file__).parent.parent / "examples"
+    text = (examples / "print_poses.py").read_text().replace('["position"]', '["orientation"]')
+    (tmp_path / "listener.py").write_text(text)
+    hear = [sys.executable, str(tmp_path / "listener.py"), at, f"{flow}/attitude/imu", "20"]
+    feed = [sys.executable, str(examples / "feed_imu.py"), at, f"{flow}/imu/imu", "1000"]
+    with subprocess.Popen(hear, stdout=subprocess.PIPE, text=True) as hearing, subprocess.Popen(feed) as feeding:
+        printed, _ = hearing.communicate(timeout=60)
+        feeding.terminate()
+    lines = [json.loads(line) for line in printed.splitlines()]
+    assert len(lines) == 20
+    assert all(abs(sum(part * part for part in line) - 1.0) < 1e-6 for line in lines)
+    running.process.terminate()
+    assert running.ends() == 130
