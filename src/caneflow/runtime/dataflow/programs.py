@@ -8,7 +8,7 @@ import re
 import sys
 import traceback
 from collections.abc import Hashable, Mapping
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -98,6 +98,9 @@ def validated_settings(program: Program, settings: Mapping[str, Any]) -> Any:
 
 def check_settings(program: Program, settings: Mapping[str, Any]) -> tuple[Any, list[Mistake]]:
     """`settings` as the program's Settings, or None and what is wrong with them."""
+    if not settings:  # as most nodes have it: nothing to be checked, which takes pydantic longer than most starts
+        with suppress(Exception):  # then the check says what is missing
+            return program.Settings(), []
     try:
         return _checked(program)(settings)
     except Exception as error:  # a check of its own that breaks: users' code may raise anything

@@ -6,6 +6,7 @@ that nobody knows is a mistake whatever the type's own stance on it.
 
 import json
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -34,7 +35,11 @@ class Checked(Generic[T]):
 
     def __init__(self, kind: Any) -> None:
         self._adapter: TypeAdapter[T] = TypeAdapter(kind)
-        self._schema: JsonSchema = self._adapter.json_schema(schema_generator=_Lenient)
+
+    @cached_property
+    def _schema(self) -> JsonSchema:
+        """What the type takes; made when it is first asked for, as it costs as much as all the rest."""
+        return self._adapter.json_schema(schema_generator=_Lenient)
 
     def __call__(self, values: Any) -> tuple[T | None, list[Mistake]]:
         """`values` as the type, or None and every mistake that stands in the way, in the order of the values."""
