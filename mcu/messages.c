@@ -9,7 +9,7 @@
 #define LARGEST_STAMP INT64_MAX
 
 /* What no sensor can say: the bounds of src/caneflow/messages/bounds.py, as the bits of doubles. */
-#define TURN_RATE UINT64_C(0x40c3880000000000)           /* 10000 rad/s */
+#define TURN_RATE UINT64_C(0x412e848000000000)           /* 1e6 rad/s */
 #define ACCELERATION UINT64_C(0x40af400000000000)        /* 4000 m/s^2 */
 #define LINEAR_ACCELERATION UINT64_C(0x40af540000000000) /* 4010 m/s^2 */
 #define COSINE UINT64_C(0x3ff8000000000000)              /* 1.5: the norm is looked at later */

@@ -139,14 +139,14 @@ def test_an_assignment_twice_is_refused() -> None:
 
 
 def test_a_row_that_no_sensor_can_say_is_counted() -> None:
-    """Beyond the bounds that a sample has, in the table's units: 5000 g and 10^6 deg/s."""
+    """Beyond the bounds that a sample has, in the table's units: 5000 g and 10^8 deg/s."""
     units = {"gyro": "deg/s", "accel": "g"}
     rows = table(
-        "0,0,0,0,0,0,1", "0.01,0,1e6,0,0,0,1", "0.02,0,0,0,0,0,-5000", "0.03,0,0,0,1,0,0", units=units, most=MOST
+        "0,0,0,0,0,0,1", "0.01,0,1e8,0,0,0,1", "0.02,0,0,0,0,0,-5000", "0.03,0,0,0,1,0,0", units=units, most=MOST
     )
     assert [reading.stamp for reading in rows.readings()] == [0, 30_000_000]
     assert str(rows.refusals) == (
-        "2 rows refused: 1 with gyro beyond 10000 rad/s (first in line 3), "
+        "2 rows refused: 1 with gyro beyond 1e+06 rad/s (first in line 3), "
         "1 with accel beyond 4000 m/s^2 (first in line 4)"
     )
 

@@ -13,9 +13,10 @@ from msgspec import Meta
 
 from caneflow.messages.arrays import Array
 
-# rad/s, 95 000 turns a minute: the BNO055's numbers end at 36, the fastest gyros at 20 000 deg/s = 349 (ADXRS649).
-# So wide a margin lets programs that try a flow out count in this field, as they do; a wild turn is for the gates.
-TURN_RATE = 1e4
+# rad/s: the BNO055's numbers end at 36, the fastest gyros at 20 000 deg/s = 349 (ADXRS649).
+# So wide a margin lets programs that try a flow out count samples in this field, as they do; a wild turn is for the
+# gates.
+TURN_RATE = 1e6
 # m/s^2: accelerometers for impacts end at 400 g = 3923 m/s^2 (H3LIS331DL), the BNO055's numbers at 328.
 ACCELERATION = 4000.0
 LINEAR_ACCELERATION = ACCELERATION + 10.0  # m/s^2: the same less gravity, in any attitude
