@@ -35,7 +35,7 @@ class RestSettings:
     largest_peak: Annotated[float, Gt(1), Le(1e6)] = 7.0  # of the noise floor
     # A gyro's bias is below 2 deg/s, a still hand turns by 0.5; walking turns the cane by 5 deg/s or more.
     largest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm over the window
-    least_standing: Factor = 0.05  # of a scan's noise, power of the ground that stands; more makes faint ground no rest
+    least_standing: Factor = 0.02  # of a scan's noise, power of the ground that stands; more makes faint ground no rest
 
 
 def peaks_and_floor(power: NDArray[np.floating], cell: float) -> tuple[float, float, float]:
