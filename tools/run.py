@@ -103,7 +103,7 @@ def command(
     recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
     if record is not None:
         record = named_at(record, datetime.now(UTC))
-    # The recording's name first, before any process; then the fork_server: what is there now is there in every node.
+    # The recording's name first, before any process; then the fork server: what is there now is there in every node.
     with (
         _kept(record, [file, replay, rig], overwrite=overwrite, parts=bool(recorder)),
         nullcontext() if in_process else ForkServer() as fork_server,

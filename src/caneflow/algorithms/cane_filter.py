@@ -57,7 +57,7 @@ class CaneFilterSettings:
     hand_ahead: Offset = 0.3  # m that the hand is carried ahead of the body: it goes sideways when the body turns
     standing_speed: Speed = 0.03  # m/s, sd of the sensors' while the bearer stands
     standing_inflation: Factor = 20.0  # samples that share one drift of the hand
-    radar_standing: Time = 0.2  # m/s, radar speed above which nobody stands, whatever the IMU says
+    radar_standing: Speed = 0.2  # m/s, radar speed above which nobody stands, whatever the IMU says
     speed_scale: Fraction | Zero = 0.012  # sd of the radar's scale: 1 cm of height; only in the covariance
     # What is given out of the horizontal covariance: in 50 simulated walks errors were that much smaller (best.md).
     covariance_share: Factor = 0.8

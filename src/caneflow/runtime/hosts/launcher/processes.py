@@ -70,7 +70,7 @@ class Processes:
     def start(self, node: str, program: Sequence[str], plan: bytes, called: Path) -> int:
         """Start the node's process with its plan, `called` so where processes are listed.
 
-        Its pid, or 0 when the fork_server is lost. Raises OSError when this process has no descriptors left.
+        Its pid, or 0 when the fork server is lost. Raises OSError when this process has no descriptors left.
         """
         with _in_memory(plan) as descriptor:
             return self._start(node, [*program, str(called)], descriptor)
