@@ -23,10 +23,10 @@ ROOM = ("best", "particle", "heading_particle", "ekf")
 def runs(recording: Path) -> list[tuple[str, str]]:
     """The graph and the setting of each run of a recording, by the sensors in it."""
     with Recording(recording) as opened:
-        streams = {f"{stream.node}/{stream.port}" for stream in opened.streams}
-    if "radar/frame" in streams:
+        streams = set(opened.streams)
+    if ("radar", "frame") in streams:
         return [("dataflow.yaml", f"fusion.method={method}") for method in CANE]
-    if "south/block" in streams:
+    if ("south", "block") in streams:
         return [("dataflows/room.yaml", f"room_tracker.method={method}") for method in ROOM]
     return []
 
@@ -34,15 +34,18 @@ def runs(recording: Path) -> list[tuple[str, str]]:
 def computed(tree: Path, flow: str, setting: str, recording: Path, folder: Path) -> tuple[int, str]:
     """How many samples this checkout computes, and the digest of their streams, stamps and bytes."""
     out = folder / "computed.mcap"
-    command = [tree / ".venv/bin/caneflow", "run", tree / flow, "--replay", recording, "--in-process", "--overwrite"]
-    done = subprocess.run([*command, "--set", setting, "--record", out], capture_output=True, text=True, check=False)
+    program: list[str | Path] = [tree / ".venv/bin/caneflow", "run", tree / flow, "--in-process", "--overwrite"]
+    command = [*program, "--replay", recording, "--set", setting, "--record", out]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SystemExit(f"{tree}: {flow} {setting} on {recording.name}: {done.stderr.strip()}")
     count, digest = 0, hashlib.sha256()
     with Recording(out) as opened:
         for sample in opened.samples():
             count += 1
-            digest.update(f"{sample.stream} {sample.stamp} {len(sample.payload)} ".encode() + sample.payload)
+            digest.update(
+                f"{sample.node}/{sample.port} {sample.stamp} {len(sample.payload)} ".encode() + sample.payload
+            )
     return count, digest.hexdigest()
 
 
@@ -55,7 +58,9 @@ def main(before: Path, recordings: list[Path]) -> int:
                 old, new = (computed(tree, flow, setting, recording, Path(folder)) for tree in (before, HERE))
                 samples += new[0]
                 differ += old != new
-                print(f"{recording.name:32} {setting:32} {'equal' if old == new else f'DIFFERS: {old} {new}'}", flush=True)
+                print(
+                    f"{recording.name:32} {setting:32} {'equal' if old == new else f'DIFFERS: {old} {new}'}", flush=True
+                )
     print(f"{samples} samples; {'equal in every byte' if not differ else f'{differ} runs differ'}")
     return 1 if differ or not samples else 0
 

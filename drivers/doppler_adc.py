@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from caneflow.algorithms.clock_fit import ClockFitSettings, LineBelow
+from caneflow.algorithms.clocks.clock_fit import ClockFitSettings, LineBelow
 from caneflow.algorithms.quantities import Time
 from caneflow.messages import DopplerBlock, bounds
 from caneflow.protocols.doppler_blocks import BlockCutter, ModuleChannels, Samples, block_length

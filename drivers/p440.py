@@ -16,7 +16,7 @@ from typing import Annotated, Literal, TypeVar
 
 from annotated_types import Ge, Le
 
-from caneflow.algorithms.clock_fit import ClockFit
+from caneflow.algorithms.clocks.clock_fit import ClockFit
 from caneflow.algorithms.quantities import Time
 from caneflow.messages import RadarFrame, bounds
 from caneflow.protocols import mrm

@@ -22,9 +22,9 @@ from typing import Annotated, Literal, Protocol
 import msgspec
 from annotated_types import Ge, Le
 
-from caneflow.algorithms.clock_fit import ClockFit, ClockFitSettings
-from caneflow.algorithms.luenberger import LuenbergerSettings
-from caneflow.algorithms.luenberger_fixed import observer_constants
+from caneflow.algorithms.cane.luenberger import LuenbergerSettings
+from caneflow.algorithms.cane.luenberger_fixed import observer_constants
+from caneflow.algorithms.clocks.clock_fit import ClockFit, ClockFitSettings
 from caneflow.algorithms.quantities import Milliseconds, Time
 from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, Sample, decode, encode
 from caneflow.protocols import uart_frames

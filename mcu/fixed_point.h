@@ -1,6 +1,6 @@
 /* Numbers without floating point: rounded products, and IEEE 754 doubles taken apart and put together by their bits.
  *
- * The same operations are `product`, `quotient` and `fixed` in src/caneflow/algorithms/luenberger_fixed.py. */
+ * The same operations are `product`, `quotient` and `fixed` in src/caneflow/algorithms/cane/luenberger_fixed.py. */
 #ifndef FIXED_POINT_H
 #define FIXED_POINT_H
 

@@ -1,6 +1,6 @@
 /* The paper's observer (eq. 9) in fixed point: ground speeds and IMU samples in, a position per IMU sample out.
  *
- * The same, line by line, is src/caneflow/algorithms/luenberger_fixed.py; tests hold the two equal in every bit. */
+ * The same, line by line, is src/caneflow/algorithms/cane/luenberger_fixed.py; tests hold the two equal in every bit. */
 #ifndef OBSERVER_H
 #define OBSERVER_H
 

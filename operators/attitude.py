@@ -14,11 +14,11 @@ from typing import Annotated, Literal, TypeAlias
 import msgspec
 from annotated_types import Ge, Le
 
-from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.gated_attitude import GatedAttitude
 from caneflow.algorithms.glitches import GlitchSettings
-from caneflow.algorithms.initial_attitude import NORTH_YAW, AttitudeMethod
-from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
+from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
+from caneflow.algorithms.inertial.gated_attitude import GatedAttitude
+from caneflow.algorithms.inertial.initial_attitude import NORTH_YAW, AttitudeMethod
+from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, from_yaw, multiply, normalized, rotate
 from caneflow.messages import Imu, Sample
 from caneflow.physics import GRAVITY

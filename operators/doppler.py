@@ -6,9 +6,9 @@ out  target : DopplerTarget   one per hop of 50 ms (a longer block gives one), o
 
 from dataclasses import dataclass, field
 
-from caneflow.algorithms.doppler_line import DopplerLineSettings, predominant_line, range_from_strength
-from caneflow.algorithms.doppler_spectrum import DopplerSpectrumSettings, SlidingSpectrum
 from caneflow.algorithms.quantities import RangeCalibration
+from caneflow.algorithms.radar.doppler_line import DopplerLineSettings, predominant_line, range_from_strength
+from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrumSettings, SlidingSpectrum
 from caneflow.messages import DopplerBlock, DopplerTarget, MessageError, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused

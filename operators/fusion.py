@@ -8,16 +8,17 @@ out  pose  : Pose         one per IMU sample
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
-from caneflow.algorithms.dead_reckoning import DeadReckoning, require_later, required_acceleration, required_orientation
+from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning
+from caneflow.algorithms.cane.kalman import KalmanFilter, KalmanSettings
+from caneflow.algorithms.cane.luenberger import LuenbergerObserver, LuenbergerSettings
+from caneflow.algorithms.cane.luenberger_fixed import FixedLuenbergerObserver, observer_constants
+from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
+from caneflow.algorithms.cane.speed_gate import CaneGlitchSettings, SpeedGate
+from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettings
 from caneflow.algorithms.glitches import GlitchGate, Readings
-from caneflow.algorithms.ground_velocity import UNOBSERVED
-from caneflow.algorithms.kalman import KalmanFilter, KalmanSettings
-from caneflow.algorithms.luenberger import LuenbergerObserver, LuenbergerSettings
-from caneflow.algorithms.luenberger_fixed import FixedLuenbergerObserver, observer_constants
-from caneflow.algorithms.naive_ins import NaiveIns, NaiveInsSettings
-from caneflow.algorithms.speed_gate import CaneGlitchSettings, SpeedGate
-from caneflow.algorithms.step_heading import StepHeading, StepHeadingSettings
+from caneflow.algorithms.inertial.imu_sample import require_later, required_acceleration, required_orientation
+from caneflow.algorithms.radar.ground_velocity import UNOBSERVED
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused

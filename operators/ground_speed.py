@@ -9,13 +9,13 @@ import math
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 
-from caneflow.algorithms.attitude_history import AttitudeHistory
-from caneflow.algorithms.dead_reckoning import require_later
-from caneflow.algorithms.footprint import CaneGeometry
 from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, Readings
-from caneflow.algorithms.ground_velocity import GroundVelocityEstimator, GroundVelocitySettings
-from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
-from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
+from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
+from caneflow.algorithms.inertial.imu_sample import require_later
+from caneflow.algorithms.radar.footprint import CaneGeometry
+from caneflow.algorithms.radar.ground_velocity import GroundVelocityEstimator, GroundVelocitySettings
+from caneflow.algorithms.radar.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
+from caneflow.algorithms.radar.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
 from caneflow.messages import GroundSpeed, Imu, RadarFrame, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused

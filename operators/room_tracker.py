@@ -19,14 +19,14 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from caneflow.algorithms.dead_reckoning import heading_of
 from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, JumpGate, Readings
+from caneflow.algorithms.inertial.imu_sample import heading_of
+from caneflow.algorithms.inertial.standing import StandingDetector, StandingSettings
 from caneflow.algorithms.quantities import Component, Length, Time, Zero
-from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
-from caneflow.algorithms.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
-from caneflow.algorithms.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor, Vector2
+from caneflow.algorithms.room.room_ekf import RoomEkf, RoomEkfSettings
+from caneflow.algorithms.room.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
+from caneflow.algorithms.room.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor, Vector2
 from caneflow.algorithms.rotations import Quaternion, from_yaw, rotate
-from caneflow.algorithms.standing import StandingDetector, StandingSettings
 from caneflow.messages import DopplerTarget, Imu, MessageError, Pose, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import ANY_PORT, Context, Emitted, Operator, Refused

@@ -37,8 +37,8 @@ from caneflow.runtime import Context, Operator
 from caneflow.runtime.dataflow.programs import check_settings
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.stages.merge import END
+from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.snapshot import pack
-from caneflow.runtime.stages.stage import Stage
 from operators.attitude import Attitude
 from operators.doppler import Doppler
 from operators.fusion import Fusion

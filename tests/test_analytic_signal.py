@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from caneflow.algorithms.analytic_signal import AnalyticSignal, fast_time_frequencies
+from caneflow.algorithms.radar.analytic_signal import AnalyticSignal, fast_time_frequencies
 from caneflow.physics import SPEED_OF_LIGHT
 
 STEP = 0.009149  # m

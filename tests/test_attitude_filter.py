@@ -10,10 +10,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from caneflow.algorithms import rotations
-from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.gyro_bias import GyroBias, GyroBiasSettings, RestDetector
-from caneflow.algorithms.initial_attitude import AttitudeEstimate, AttitudeMethod
-from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
+from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
+from caneflow.algorithms.inertial.gyro_bias import GyroBias, GyroBiasSettings, RestDetector
+from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, AttitudeMethod
+from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,

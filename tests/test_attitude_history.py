@@ -5,7 +5,7 @@ import math
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from caneflow.algorithms.attitude_history import AttitudeHistory
+from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
 from caneflow.algorithms.rotations import IDENTITY, Quaternion, from_yaw
 
 MS = 1_000_000  # ns

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.attitude_recovery import RECOVERY, Holes, Recovery, UndisturbedField
-from caneflow.algorithms.initial_attitude import AttitudeMethod
-from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
+from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
+from caneflow.algorithms.inertial.attitude_recovery import RECOVERY, Holes, Recovery, UndisturbedField
+from caneflow.algorithms.inertial.initial_attitude import AttitudeMethod
+from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import (
     IDENTITY,
     Quaternion,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from caneflow.algorithms.background import Background
+from caneflow.algorithms.radar.background import Background
 
 
 def removed(scans: np.ndarray, elapsed: np.ndarray, time_constant: float) -> np.ndarray:

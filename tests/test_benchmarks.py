@@ -18,7 +18,7 @@ from caneflow.messages import GroundSpeed, Imu, RadarFrame, Sample, decode, numb
 from caneflow.messages.rig import read_rig
 from caneflow.runtime import Context, Emitted, Operator
 from caneflow.runtime.plan import InputPlan, OutputPlan
-from caneflow.runtime.stages.stage import Stage
+from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.simulation.scenario import Walk, simulate_walk
 from operators.fusion import Fusion, FusionSettings
 from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings

@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from caneflow.examinations import p440
+from caneflow.device_checks import p440
 from caneflow.protocols import mrm
 from tools import doctor
 

@@ -26,8 +26,8 @@ from caneflow.runtime.stages.byte_budget import (
     weight,
     weight_of,
 )
-from caneflow.runtime.stages.history import History
 from caneflow.runtime.stages.merge import END
+from caneflow.runtime.stages.sent_samples import History
 from caneflow.runtime.stages.streams import CAUSES_NAMED, LONGEST_CAUSE, Arrivals
 from tests.flows import launchers
 from tests.test_stage import emitted, imu, stage

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings, level_covariance
-from caneflow.algorithms.dead_reckoning import PoseEstimate
-from caneflow.algorithms.heading_hypotheses import Heading
+from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings, level_covariance
+from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.cane.heading_hypotheses import Heading
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,

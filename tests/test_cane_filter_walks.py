@@ -12,15 +12,15 @@ import pytest
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from caneflow.algorithms.attitude_history import AttitudeHistory
-from caneflow.algorithms.cane_filter import CaneFilter, CaneFilterSettings
-from caneflow.algorithms.cane_smoother import CaneSmoother
-from caneflow.algorithms.dead_reckoning import PoseEstimate
-from caneflow.algorithms.footprint import CaneGeometry
-from caneflow.algorithms.ground_velocity import GroundVelocityEstimator, GroundVelocitySettings, VelocityEstimate
-from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
+from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings
+from caneflow.algorithms.cane.cane_smoother import CaneSmoother
+from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
+from caneflow.algorithms.judging.track_errors import Track, TrackErrors, boresight_yaws, track_errors
+from caneflow.algorithms.radar.footprint import CaneGeometry
+from caneflow.algorithms.radar.ground_velocity import GroundVelocityEstimator, GroundVelocitySettings, VelocityEstimate
+from caneflow.algorithms.radar.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
 from caneflow.algorithms.rotations import Quaternion, Vector
-from caneflow.algorithms.track_errors import Track, TrackErrors, boresight_yaws, track_errors
 from caneflow.simulation.scenario import simulate_walk
 
 Floats = NDArray[np.float64]

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from caneflow.algorithms.dead_reckoning import heading_of
+from caneflow.algorithms.inertial.imu_sample import heading_of
 from caneflow.messages import Imu, Pose, RadarFrame, Sample
 from caneflow.messages.rig import read_rig
 from caneflow.runtime import Context

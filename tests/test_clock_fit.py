@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from caneflow.algorithms.clock_fit import ClockFit, ClockFitSettings, LineBelow
+from caneflow.algorithms.clocks.clock_fit import ClockFit, ClockFitSettings, LineBelow
 
 SECOND = 1_000_000_000  # ns
 HOST = 1_000_000 * SECOND  # some reading of the host's clock

@@ -10,7 +10,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caneflow.algorithms.clock_offset import ClockEstimate, ClockOffset, ClockOffsetSettings
+from caneflow.algorithms.clocks.clock_offset import ClockEstimate, ClockOffset, ClockOffsetSettings
 from caneflow.messages import Imu, control_key, decode
 from caneflow.messages.control import Clock
 from caneflow.runtime.hosts.launcher.clocks import Answer, Clocks

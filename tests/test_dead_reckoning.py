@@ -12,18 +12,13 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from caneflow.algorithms import rotations
-from caneflow.algorithms.dead_reckoning import (
-    HISTORY,
-    DeadReckoning,
-    GroundVelocity,
-    SampleClock,
-    heading_of,
-)
-from caneflow.algorithms.kalman import KalmanFilter, KalmanSettings
-from caneflow.algorithms.luenberger import LuenbergerObserver, LuenbergerSettings
-from caneflow.algorithms.naive_ins import NaiveIns, NaiveInsSettings
-from caneflow.algorithms.step_heading import StepHeading, StepHeadingSettings
-from caneflow.algorithms.track_errors import Track, TrackErrors, boresight_yaws, track_errors
+from caneflow.algorithms.cane.dead_reckoning import HISTORY, DeadReckoning, GroundVelocity
+from caneflow.algorithms.cane.kalman import KalmanFilter, KalmanSettings
+from caneflow.algorithms.cane.luenberger import LuenbergerObserver, LuenbergerSettings
+from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
+from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettings
+from caneflow.algorithms.inertial.imu_sample import SampleClock, heading_of
+from caneflow.algorithms.judging.track_errors import Track, TrackErrors, boresight_yaws, track_errors
 
 Floats = NDArray[np.float64]
 WALKS = Path(__file__).parents[1].parent / "shared" / "data" / "walks"

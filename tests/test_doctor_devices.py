@@ -20,7 +20,7 @@ import typer
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from caneflow.examinations import mpu9250, p440, ports
+from caneflow.device_checks import mpu9250, p440, ports
 from caneflow.protocols import mrm
 from caneflow.protocols.mpu9250_emulator import Emulator, Faults, Motion
 from caneflow.protocols.mrm_emulator import Moment, RadarEmulator

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import wavfile
 
-from caneflow.algorithms.doppler_line import (
+from caneflow.algorithms.radar.doppler_line import (
     DopplerLine,
     DopplerLineSettings,
     predominant_line,
     range_from_strength,
 )
-from caneflow.algorithms.doppler_spectrum import (
+from caneflow.algorithms.radar.doppler_spectrum import (
     FLOOR_BIAS,
     DopplerSpectrum,
     DopplerSpectrumSettings,

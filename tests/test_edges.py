@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from caneflow.algorithms.edges import EDGE_BEYOND_SPEED, superior_edges
-from caneflow.algorithms.range_doppler import hann
+from caneflow.algorithms.radar.edges import EDGE_BEYOND_SPEED, superior_edges
+from caneflow.algorithms.radar.range_doppler import hann
 
 PADDING = 4  # Doppler bins per resolution cell
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caneflow.algorithms.error_summary import consistent_mean, normalized_error_squared, summarized
-from caneflow.algorithms.track_errors import Track, final_offset, track_errors
+from caneflow.algorithms.judging.error_summary import consistent_mean, normalized_error_squared, summarized
+from caneflow.algorithms.judging.track_errors import Track, final_offset, track_errors
 
 Floats = NDArray[np.float64]
 

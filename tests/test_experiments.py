@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer import Exit
 
-from caneflow.algorithms.track_errors import Track
+from caneflow.algorithms.judging.track_errors import Track
 from caneflow.errors import CaneflowError
 from caneflow.runtime.replays.evaluation import FIGURES, Evaluation
 from caneflow.simulation.scenario import SCENARIOS

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from caneflow.algorithms.footprint import NO_RAYS, CaneGeometry, Fan, RayCaster, antenna_height, pitch
+from caneflow.algorithms.radar.footprint import NO_RAYS, CaneGeometry, Fan, RayCaster, antenna_height, pitch
 from caneflow.algorithms.rotations import Quaternion, from_rotation_vector, from_yaw, multiply
 
 STEP = 0.00915  # m

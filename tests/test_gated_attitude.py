@@ -5,11 +5,11 @@ from collections.abc import Iterable
 
 import pytest
 
-from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.gated_attitude import GatedAttitude
 from caneflow.algorithms.glitches import GlitchSettings
-from caneflow.algorithms.initial_attitude import AttitudeMethod
-from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
+from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
+from caneflow.algorithms.inertial.gated_attitude import GatedAttitude
+from caneflow.algorithms.inertial.initial_attitude import AttitudeMethod
+from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,

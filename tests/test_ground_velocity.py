@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caneflow.algorithms.attitude_history import AttitudeHistory
-from caneflow.algorithms.background import Background
-from caneflow.algorithms.footprint import CaneGeometry
-from caneflow.algorithms.ground_velocity import (
+from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
+from caneflow.algorithms.radar.background import Background
+from caneflow.algorithms.radar.footprint import CaneGeometry
+from caneflow.algorithms.radar.ground_velocity import (
     UNOBSERVED,
     GroundVelocityEstimator,
     GroundVelocitySettings,
     VelocityEstimate,
     beam_factor,
 )
-from caneflow.algorithms.moving_returns import MovingReturns, RadarParameters, StandingPicture
+from caneflow.algorithms.radar.moving_returns import MovingReturns, RadarParameters, StandingPicture
 from caneflow.algorithms.rotations import Quaternion, from_rotation_vector
 from caneflow.physics import SPEED_OF_LIGHT
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
-from caneflow.algorithms.pulse_pairs import PulsePairWindow, line_phase
+from caneflow.algorithms.radar.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
+from caneflow.algorithms.radar.pulse_pairs import PulsePairWindow, line_phase
 from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.protocols.mrm_scans import Scan, parse_log
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from caneflow.algorithms.gyro_yaw import GyroYaw
+from caneflow.algorithms.inertial.gyro_yaw import GyroYaw
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,

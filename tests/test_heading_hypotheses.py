@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
-from caneflow.algorithms.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
+from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 
 DEGREE = math.pi / 180.0
 Floats = NDArray[np.float64]

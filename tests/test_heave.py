@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from caneflow.algorithms.heave import HeaveObserver, HeaveSettings
+from caneflow.algorithms.inertial.heave import HeaveObserver, HeaveSettings
 
 
 def test_agrees_with_full_matrices() -> None:

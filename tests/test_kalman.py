@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from caneflow.algorithms import rotations
-from caneflow.algorithms.kalman import (
+from caneflow.algorithms.cane.kalman import (
     INITIAL_ACCELERATION,
     INITIAL_VELOCITY,
     AxisCovariance,

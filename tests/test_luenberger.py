@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caneflow.algorithms import rotations
-from caneflow.algorithms.dead_reckoning import DelayCompensation, PoseEstimate
-from caneflow.algorithms.luenberger import (
+from caneflow.algorithms.cane.dead_reckoning import DelayCompensation, PoseEstimate
+from caneflow.algorithms.cane.luenberger import (
     LuenbergerObserver,
     LuenbergerSettings,
     observer_eigenvalues,

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from caneflow.algorithms import luenberger_fixed
-from caneflow.algorithms.luenberger import Gain, LuenbergerObserver, LuenbergerSettings
-from caneflow.algorithms.luenberger_fixed import (
+from caneflow.algorithms.cane import luenberger_fixed
+from caneflow.algorithms.cane.luenberger import Gain, LuenbergerObserver, LuenbergerSettings
+from caneflow.algorithms.cane.luenberger_fixed import (
     ACCELERATION,
     LARGEST,
     POSITION,

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caneflow.algorithms import rotations
-from caneflow.algorithms.initial_attitude import initial_attitude, level
-from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings, objective_gradient
+from caneflow.algorithms.inertial.initial_attitude import initial_attitude, level
+from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings, objective_gradient
 from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, from_rotation_vector, multiply, rotate
 
 PERIOD_NS = 10_000_000

@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from caneflow.algorithms.luenberger import LuenbergerSettings
-from caneflow.algorithms.luenberger_fixed import METHOD, FixedLuenbergerObserver, observer_constants
+from caneflow.algorithms.cane.luenberger import LuenbergerSettings
+from caneflow.algorithms.cane.luenberger_fixed import METHOD, FixedLuenbergerObserver, observer_constants
 from caneflow.algorithms.rotations import Vector
 from caneflow.errors import CaneflowError
 from caneflow.messages import (

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caneflow.algorithms.analytic_signal import AnalyticSignal
-from caneflow.algorithms.background import Background
-from caneflow.algorithms.moving_returns import (
+from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
+from caneflow.algorithms.radar.background import Background
+from caneflow.algorithms.radar.moving_returns import (
     MOST_HELD,
     MovingReturns,
     MovingReturnsFilter,

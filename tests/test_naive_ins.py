@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caneflow.algorithms import rotations
-from caneflow.algorithms.naive_ins import NaiveIns, NaiveInsSettings
+from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
 
 Vector = rotations.Vector
 STILL: Vector = (0.0, 0.0, 0.0)

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caneflow.algorithms.attitude_history import AttitudeHistory
-from caneflow.algorithms.footprint import CaneGeometry
-from caneflow.algorithms.moving_returns import (
+from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
+from caneflow.algorithms.radar.footprint import CaneGeometry
+from caneflow.algorithms.radar.moving_returns import (
     MovingReturnsFilter,
     MovingReturnsSettings,
     RadarParameters,
 )
-from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
-from caneflow.algorithms.rest import RestSettings
+from caneflow.algorithms.radar.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
+from caneflow.algorithms.radar.rest import RestSettings
 from caneflow.algorithms.rotations import Quaternion, Vector, from_rotation_vector
 from caneflow.physics import SPEED_OF_LIGHT
 

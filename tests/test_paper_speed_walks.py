@@ -10,11 +10,11 @@ import pytest
 from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
-from caneflow.algorithms.attitude_history import AttitudeHistory
-from caneflow.algorithms.footprint import CaneGeometry
-from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
-from caneflow.algorithms.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
-from caneflow.algorithms.range_doppler import hann
+from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
+from caneflow.algorithms.radar.footprint import CaneGeometry
+from caneflow.algorithms.radar.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
+from caneflow.algorithms.radar.paper_speed import PaperSpeed, PaperSpeedSettings, SpeedEstimate
+from caneflow.algorithms.radar.range_doppler import hann
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caneflow.algorithms.particle_filter import (
+from caneflow.algorithms.room.particle_filter import (
     Particles,
     ParticleSettings,
     normal_with_outliers,
     student_t,
     weighted_covariance,
 )
-from caneflow.algorithms.resampling import effective_number, systematic
+from caneflow.algorithms.room.resampling import effective_number, systematic
 
 
 def test_the_mean_number_of_copies_is_the_weight_times_the_count() -> None:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caneflow.algorithms.analytic_signal import AnalyticSignal
-from caneflow.algorithms.background import Background
-from caneflow.algorithms.range_doppler import bin_of_range, hann, range_doppler_map, speed_of_bin
+from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
+from caneflow.algorithms.radar.background import Background
+from caneflow.algorithms.radar.range_doppler import bin_of_range, hann, range_doppler_map, speed_of_bin
 from caneflow.protocols.mrm_scans import Scan, parse_log
 
 RAIL = Path(__file__).parents[1].parent / "shared" / "data" / "p440-rail-mocap"

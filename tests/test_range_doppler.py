@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from caneflow.algorithms import range_doppler as rd
+from caneflow.algorithms.radar import range_doppler as rd
 from caneflow.physics import SPEED_OF_LIGHT
 
 PERIOD, CARRIER = 0.01, 4.3e9  # s, Hz

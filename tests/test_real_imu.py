@@ -14,12 +14,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.initial_attitude import AttitudeMethod
-from caneflow.algorithms.madgwick import Madgwick, MadgwickSettings
-from caneflow.algorithms.naive_ins import NaiveIns, NaiveInsSettings
+from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
+from caneflow.algorithms.cane.zero_velocity import StanceSettings, ZeroVelocity, ZeroVelocitySettings
+from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
+from caneflow.algorithms.inertial.initial_attitude import AttitudeMethod
+from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import Vector
-from caneflow.algorithms.zero_velocity import StanceSettings, ZeroVelocity, ZeroVelocitySettings
 from caneflow.protocols.imu_csv import ImuTable, Reading
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"

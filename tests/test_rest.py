@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from caneflow.algorithms.range_doppler import hann, range_doppler_map
-from caneflow.algorithms.rest import RestSettings, ground_stands, is_at_rest, peaks_and_floor
+from caneflow.algorithms.radar.range_doppler import hann, range_doppler_map
+from caneflow.algorithms.radar.rest import RestSettings, ground_stands, is_at_rest, peaks_and_floor
 
 SETTINGS = RestSettings()
 STILL = 0.01  # rad/s

@@ -16,9 +16,9 @@ from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.stages import rollback
 from caneflow.runtime.stages.merge import END
+from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.snapshot import pack
 from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
-from caneflow.runtime.stages.stage import Stage
 
 GOOD, REFUSED, FAILS = 1.0, -1.0, 800.0  # of the gyro's x: exp(800) is no number
 SINGULAR, BUG, NUMPY, WRONG_OUTPUT, LATE, VALUE_ERROR = 801.0, 802.0, 803.0, 804.0, 805.0, 806.0

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from caneflow import command
-from caneflow.algorithms.doppler_spectrum import DopplerSpectrumSettings
-from caneflow.algorithms.room_calibration import CalibrationSettings, integrated_ranges, range_calibration, sight
-from caneflow.algorithms.room_tracking import StaticSensor
+from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrumSettings
+from caneflow.algorithms.room.room_calibration import CalibrationSettings, integrated_ranges, range_calibration, sight
+from caneflow.algorithms.room.room_tracking import StaticSensor
 from caneflow.algorithms.rotations import from_yaw
 from caneflow.messages import DopplerBlock, DopplerTarget, Imu, MessageError, Pose, Sample, numbered
 from caneflow.messages.rig import Rig

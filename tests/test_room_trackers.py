@@ -11,14 +11,14 @@ import pytest
 from scipy.io import loadmat
 from scipy.signal import hilbert
 
-from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
-from caneflow.algorithms.room_particles import (
+from caneflow.algorithms.room.room_ekf import RoomEkf, RoomEkfSettings
+from caneflow.algorithms.room.room_particles import (
     HeadingParticleTracker,
     ParticleTracker,
     RoomParticleSettings,
     expected_strength,
 )
-from caneflow.algorithms.room_tracking import (
+from caneflow.algorithms.room.room_tracking import (
     Echo,
     HeadingHistory,
     MotionWatch,

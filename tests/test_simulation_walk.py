@@ -7,7 +7,8 @@ import pytest
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from caneflow.simulation import attitude, wander
+from caneflow.simulation import attitude
+from caneflow.simulation import smooth_noise as wander
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.course import Shape, course
 from caneflow.simulation.walk import RATE, Motion, MotionSettings, Pause, Rig, walk

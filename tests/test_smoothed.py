@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from caneflow.algorithms.cane_filter import CaneFilterSettings
+from caneflow.algorithms.cane.cane_filter import CaneFilterSettings
 from caneflow.messages import GroundSpeed, Imu, Pose
 from caneflow.messages.rig import Rig
 from caneflow.recording import Recording
@@ -17,7 +17,7 @@ from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import Context
 from caneflow.runtime.replays.evaluation import chosen_methods, offered_methods
-from caneflow.runtime.replays.hindsight import smoothed_poses, smoother
+from caneflow.runtime.replays.smoothed_method import smoothed_poses, smoother
 from tools import simulate
 
 ROOT = Path(__file__).parents[1]

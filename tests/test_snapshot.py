@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 from pydantic import BaseModel
 
-from caneflow.algorithms.gyro_bias import GyroBias
+from caneflow.algorithms.inertial.gyro_bias import GyroBias
 from caneflow.messages import Imu, RadarFrame, decode, numbered
 from caneflow.runtime.stages.snapshot import SnapshotError, pack, unpack
 
@@ -432,7 +432,7 @@ HOSTILE = [
         [tag, *number, name, *rest]
         for name in (
             "caneflow.command:os.system",
-            "caneflow.messages.samples:math.sin",
+            "caneflow.messages.motion:math.sin",
             "caneflow.messages.arrays:struct.pack",
             f"{HERE}:os.system",
             f"{HERE}:subprocess.Popen",
@@ -461,7 +461,7 @@ HOSTILE = [
     ["object", 0, "builtins:dict", []],
     ["named tuple", 0, f"{HERE}:Point", [1.0]],
     ["named tuple", 0, f"{HERE}:State", [1.0]],
-    ["struct", 0, "caneflow.messages.samples:Imu", ["stamp", 1]],
+    ["struct", 0, "caneflow.messages.motion:Imu", ["stamp", 1]],
     ["struct", 0, f"{HERE}:State", []],
     ["member", f"{HERE}:Colour", "GREEN"],
     ["member", f"{HERE}:Colour", "__class__"],

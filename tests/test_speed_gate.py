@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from caneflow.algorithms.speed_gate import CaneGlitchSettings, SpeedGate
+from caneflow.algorithms.cane.speed_gate import CaneGlitchSettings, SpeedGate
 
 PERIOD_NS = 50_000_000
 

@@ -2,7 +2,7 @@
 
 import math
 
-from caneflow.algorithms.standing import StandingDetector, StandingSettings
+from caneflow.algorithms.inertial.standing import StandingDetector, StandingSettings
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.signal import find_peaks
 
 from caneflow.algorithms import rotations
-from caneflow.algorithms.dead_reckoning import PoseEstimate
-from caneflow.algorithms.step_heading import StepHeading, StepHeadingSettings
+from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettings
 
 Vector = rotations.Vector
 PERIOD = 0.01  # s

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from caneflow.algorithms.error_summary import consistent_mean
+from caneflow.algorithms.judging.error_summary import consistent_mean
 from caneflow.messages import Pose
 from caneflow.recording import TRUTH, Recording, RecordingWriter
 from caneflow.runtime.dataflow.loading import load

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caneflow import command
-from caneflow.algorithms.track_errors import track_errors
+from caneflow.algorithms.judging.track_errors import track_errors
 from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
 from caneflow.recording import RecordingWriter
 from tools.plot import read_picture, summary

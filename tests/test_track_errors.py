@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from caneflow.algorithms.track_errors import Track, boresight_yaws, relative_error, track_errors
+from caneflow.algorithms.judging.track_errors import Track, boresight_yaws, relative_error, track_errors
 
 Floats = NDArray[np.float64]
 CHECKS = Path(__file__).parents[1].parent / "shared" / "checks"

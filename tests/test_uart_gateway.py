@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from caneflow.algorithms.luenberger import LuenbergerSettings
-from caneflow.algorithms.luenberger_fixed import METHOD, FixedLuenbergerObserver, observer_constants
+from caneflow.algorithms.cane.luenberger import LuenbergerSettings
+from caneflow.algorithms.cane.luenberger_fixed import METHOD, FixedLuenbergerObserver, observer_constants
 from caneflow.algorithms.rotations import Vector, from_yaw
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample, decode, encode
 from caneflow.messages.rig import Rig

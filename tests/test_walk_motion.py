@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from caneflow.algorithms.walk_motion import WalkMotion, WalkMotionSettings
+from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
 
 
 def test_agrees_with_full_matrices() -> None:

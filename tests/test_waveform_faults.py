@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from caneflow.algorithms.waveform_faults import mended
+from caneflow.algorithms.radar.waveform_faults import mended
 
 COUNT = 1024
 

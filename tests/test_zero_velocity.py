@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caneflow.algorithms.dead_reckoning import DeadReckoning, PoseEstimate
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
+from caneflow.algorithms.cane.zero_velocity import StanceDetector, StanceSettings, ZeroVelocity, ZeroVelocitySettings
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,
@@ -18,7 +19,6 @@ from caneflow.algorithms.rotations import (
     multiply,
     rotate,
 )
-from caneflow.algorithms.zero_velocity import StanceDetector, StanceSettings, ZeroVelocity, ZeroVelocitySettings
 
 RATE = 200.0  # Hz
 PERIOD_NS = 5_000_000

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from caneflow.algorithms.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.dead_reckoning import heading_of
-from caneflow.algorithms.doppler_line import DopplerLineSettings, predominant_line
-from caneflow.algorithms.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
-from caneflow.algorithms.room_calibration import CalibrationSettings, counting, hops_over, range_calibration, sight
-from caneflow.algorithms.room_ekf import RoomEkf, RoomEkfSettings
-from caneflow.algorithms.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
-from caneflow.algorithms.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor
+from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
+from caneflow.algorithms.inertial.imu_sample import heading_of
+from caneflow.algorithms.inertial.standing import StandingDetector, StandingSettings
+from caneflow.algorithms.radar.doppler_line import DopplerLineSettings, predominant_line
+from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
+from caneflow.algorithms.room.room_calibration import CalibrationSettings, counting, hops_over, range_calibration, sight
+from caneflow.algorithms.room.room_ekf import RoomEkf, RoomEkfSettings
+from caneflow.algorithms.room.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
+from caneflow.algorithms.room.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor
 from caneflow.algorithms.rotations import rotate
-from caneflow.algorithms.standing import StandingDetector, StandingSettings
 from caneflow.errors import CaneflowError
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.options import Overwrite

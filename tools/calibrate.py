@@ -10,8 +10,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from caneflow.algorithms.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
-from caneflow.algorithms.room_calibration import (
+from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
+from caneflow.algorithms.room.room_calibration import (
     CalibrationSettings,
     Hops,
     RangeCalibration,
@@ -21,7 +21,7 @@ from caneflow.algorithms.room_calibration import (
     range_calibration,
     sight,
 )
-from caneflow.algorithms.room_tracking import StaticSensor
+from caneflow.algorithms.room.room_tracking import StaticSensor
 from caneflow.errors import CaneflowError
 from caneflow.messages import DopplerBlock, Pose
 from caneflow.messages.rig import Rig

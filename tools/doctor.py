@@ -9,9 +9,9 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from caneflow.device_checks import bno055, doppler_adc, mpu9250, p440
+from caneflow.device_checks.samples import examine_samples
 from caneflow.errors import CaneflowError
-from caneflow.examinations import bno055, doppler_adc, mpu9250, p440
-from caneflow.examinations.samples import examine_samples
 from caneflow.options import At, Keys
 from caneflow.printable import printable
 from caneflow.runtime import Source

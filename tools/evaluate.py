@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
+from caneflow.algorithms.judging.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
 from caneflow.options import Overwrite
 from caneflow.outputs import require_no_input, whole
 from caneflow.printable import printable

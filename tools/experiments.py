@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.progress import track
 
 import caneflow
-from caneflow.algorithms.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
-from caneflow.algorithms.track_errors import aligned
+from caneflow.algorithms.judging.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
+from caneflow.algorithms.judging.track_errors import aligned
 from caneflow.errors import CaneflowError
 from caneflow.options import Overwrite
 from caneflow.outputs import made_folder, whole

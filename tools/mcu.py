@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from caneflow.algorithms.luenberger import LuenbergerSettings
-from caneflow.algorithms.luenberger_fixed import GAIN, METHOD, UNIT, ObserverConstants, observer_constants
+from caneflow.algorithms.cane.luenberger import LuenbergerSettings
+from caneflow.algorithms.cane.luenberger_fixed import GAIN, METHOD, UNIT, ObserverConstants, observer_constants
 from caneflow.errors import CaneflowError
 from caneflow.messages.rig import read_rig
 from caneflow.options import Overwrite

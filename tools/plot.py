@@ -10,10 +10,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from caneflow.algorithms.analytic_signal import AnalyticSignal
-from caneflow.algorithms.range_doppler import hann, range_doppler_map, speed_limit
+from caneflow.algorithms.judging.track_errors import START_NS, Track, boresight_yaws, track_errors
+from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
+from caneflow.algorithms.radar.range_doppler import hann, range_doppler_map, speed_limit
 from caneflow.algorithms.rotations import Vector
-from caneflow.algorithms.track_errors import START_NS, Track, boresight_yaws, track_errors
 from caneflow.errors import CaneflowError
 from caneflow.messages import GroundSpeed, Pose, RadarFrame
 from caneflow.options import Overwrite

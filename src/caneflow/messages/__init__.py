@@ -7,16 +7,10 @@ if TYPE_CHECKING:
     from caneflow.messages.codec import MAX_PAYLOAD, MEDIA_TYPE, decode, encode, json_schema, numbered, with_number
     from caneflow.messages.errors import MessageError
     from caneflow.messages.keys import NAME, NAME_RULE, control_key, sample_key, stream_of
-    from caneflow.messages.samples import (
-        SAMPLES,
-        DopplerBlock,
-        DopplerTarget,
-        GroundSpeed,
-        Imu,
-        Pose,
-        RadarFrame,
-        Sample,
-    )
+    from caneflow.messages.motion import GroundSpeed, Imu, Pose
+    from caneflow.messages.radar import DopplerBlock, DopplerTarget, RadarFrame
+    from caneflow.messages.registry import SAMPLES
+    from caneflow.messages.sample import Sample
 
 __all__ = [
     "MAX_PAYLOAD",
@@ -46,12 +40,17 @@ LIGHT = {  # where what needs no numpy is, which takes as long to import as all 
     "MessageError": "errors",
     **dict.fromkeys(("NAME", "NAME_RULE", "control_key", "sample_key", "stream_of"), "keys"),
 }
-CODEC = ("MAX_PAYLOAD", "MEDIA_TYPE", "decode", "encode", "json_schema", "numbered", "with_number")
+ROOMS = {
+    "Sample": "sample",
+    "SAMPLES": "registry",
+    **dict.fromkeys(("Imu", "GroundSpeed", "Pose"), "motion"),
+    **dict.fromkeys(("RadarFrame", "DopplerBlock", "DopplerTarget"), "radar"),
+}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    room = LIGHT.get(name, "codec" if name in CODEC else "samples")
+    room = LIGHT.get(name) or ROOMS.get(name, "codec")
     value = globals()[name] = getattr(import_module(f"{__name__}.{room}"), name)
     return value

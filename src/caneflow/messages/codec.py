@@ -8,7 +8,7 @@ import numpy as np
 
 from caneflow.messages import arrays
 from caneflow.messages.errors import MessageError
-from caneflow.messages.samples import Sample
+from caneflow.messages.sample import Sample
 
 MAX_PAYLOAD = 32 * 2**20  # bytes; a 4 MB frame is the largest that anybody asked for
 MAX_SEQ = 2**40  # 35 years at 1 kHz; what is counted as lost must fit into a message as well, however often

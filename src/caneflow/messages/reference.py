@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from caneflow.messages.codec import json_schema
-from caneflow.messages.samples import SAMPLES
+from caneflow.messages.registry import SAMPLES
 
 
 def table(name: str) -> str:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
-from caneflow.algorithms.range_doppler import SlowTimeWindow, hann, range_doppler_map, speed_limit
+from caneflow.algorithms.radar.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
+from caneflow.algorithms.radar.range_doppler import SlowTimeWindow, hann, range_doppler_map, speed_limit
 from caneflow.messages import RadarFrame
 
 SCANS = 64  # in one map: 0.64 s at 100 Hz

@@ -45,14 +45,14 @@ from caneflow.runtime.hosts.process.recent_delays import RecentDelays
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.stages.byte_budget import WAITING, weight
-from caneflow.runtime.stages.feed import Feed
-from caneflow.runtime.stages.history import History
 from caneflow.runtime.stages.merge import BEGIN, END
+from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.references import SnapshotError
+from caneflow.runtime.stages.sent_samples import History
+from caneflow.runtime.stages.sink_stage import Tap
 from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
-from caneflow.runtime.stages.stage import Stage
+from caneflow.runtime.stages.source_stage import Feed
 from caneflow.runtime.stages.streams import AHEAD_KEPT
-from caneflow.runtime.stages.tap import Tap
 from caneflow.runtime.wording import one_line
 
 log = logging.getLogger(__name__)

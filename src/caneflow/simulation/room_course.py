@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.course import Course
-from caneflow.simulation.wander import slow
+from caneflow.simulation.smooth_noise import slow
 
 RATE = 200  # Hz, of a person's motion: ten times what a limb does (see doppler_module.py for what lies between)
 

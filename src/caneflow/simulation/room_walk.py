@@ -15,7 +15,7 @@ from numpy.random import Generator
 
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.room_course import RATE, Trajectory
-from caneflow.simulation.wander import slow
+from caneflow.simulation.smooth_noise import slow
 
 NotNegative = Annotated[float, Ge(0)]
 Positive = Annotated[float, Gt(0)]

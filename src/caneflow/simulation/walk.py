@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.course import Course, Shape, course
-from caneflow.simulation.wander import slow, tremulous
+from caneflow.simulation.smooth_noise import slow, tremulous
 
 RATE = 1000  # Hz, of the motion
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.analytic_signal import AnalyticSignal
-from caneflow.algorithms.edges import EDGE_BEYOND_SPEED, superior_edges
-from caneflow.algorithms.range_doppler import hann, range_doppler_map, speed_limit, speed_per_bin
-from caneflow.algorithms.rest import peaks_and_floor
+from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
+from caneflow.algorithms.radar.edges import EDGE_BEYOND_SPEED, superior_edges
+from caneflow.algorithms.radar.range_doppler import hann, range_doppler_map, speed_limit, speed_per_bin
+from caneflow.algorithms.radar.rest import peaks_and_floor
 from caneflow.messages import RadarFrame
 
 SCANS = 64  # of slow time, one spectrum

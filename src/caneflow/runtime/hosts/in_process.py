@@ -20,9 +20,9 @@ from caneflow.runtime.outcome import Outcome, note_losses
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source
 from caneflow.runtime.replayed import REPLAYER_MODULE
-from caneflow.runtime.stages.feed import Feed
-from caneflow.runtime.stages.stage import Stage
-from caneflow.runtime.stages.tap import Tap
+from caneflow.runtime.stages.operator_stage import Stage
+from caneflow.runtime.stages.sink_stage import Tap
+from caneflow.runtime.stages.source_stage import Feed
 
 Arriving: TypeAlias = tuple[str, str, Sample | Encoded]  # node, port, sample
 

@@ -14,10 +14,10 @@ from typing import Any, Literal, TypeAlias, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from caneflow.algorithms.cane_filter import CaneFilterSettings
-from caneflow.algorithms.error_summary import normalized_error_squared
+from caneflow.algorithms.cane.cane_filter import CaneFilterSettings
+from caneflow.algorithms.judging.error_summary import normalized_error_squared
+from caneflow.algorithms.judging.track_errors import Floats, Track, TrackErrors, final_offset, track_errors
 from caneflow.algorithms.rotations import Vector
-from caneflow.algorithms.track_errors import Floats, Track, TrackErrors, final_offset, track_errors
 from caneflow.errors import CaneflowError
 from caneflow.messages import Pose, Sample
 from caneflow.recording import TRUTH, Recording
@@ -28,7 +28,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
 from caneflow.runtime.program import Sink
 from caneflow.runtime.replayed import Replay
-from caneflow.runtime.replays.hindsight import HINDSIGHT_OF, SMOOTHED, smoother
+from caneflow.runtime.replays.smoothed_method import HINDSIGHT_OF, SMOOTHED, smoother
 from caneflow.runtime.replays.workers import mapped, mapped_on_cluster
 from caneflow.runtime.wording import did_you_mean, listed, one_line
 

@@ -14,15 +14,15 @@ import msgspec
 
 import caneflow
 from caneflow.runtime.program import Operator
-from caneflow.runtime.stages.history import Kept
+from caneflow.runtime.stages.operator_stage import StageState
 from caneflow.runtime.stages.references import SnapshotError
+from caneflow.runtime.stages.sent_samples import Kept
 from caneflow.runtime.stages.snapshot import pack, unpack
-from caneflow.runtime.stages.stage import StageState
 from caneflow.runtime.wording import one_line
 
 log = logging.getLogger(__name__)
 
-LAYOUT = 2  # of the file: one of another layout is not read
+LAYOUT = 3  # of the file: one of another layout is not read
 OTHERS_WRITE = 0o022
 
 

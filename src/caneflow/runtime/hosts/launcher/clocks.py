@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from caneflow.algorithms.clock_offset import ClockEstimate, ClockOffset, ClockOffsetSettings
+from caneflow.algorithms.clocks.clock_offset import ClockEstimate, ClockOffset, ClockOffsetSettings
 from caneflow.messages import MessageError, control_key, decode, encode
 from caneflow.messages.control import Clock
 

@@ -1,0 +1,482 @@
+"""`method: best`: radar velocity, IMU and magnetic field into a track (docs/methods/best.md).
+
+Velocity is estimated in the gyro's frame (walk_motion.py), the heading of that frame and the track by weighing many
+gyro errors against the magnetic field (heading_hypotheses.py), height by itself (heave.py).
+"""
+
+import cmath
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
+from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
+from caneflow.algorithms.inertial.gyro_yaw import GyroYaw
+from caneflow.algorithms.inertial.heave import HeaveObserver, HeaveSettings
+from caneflow.algorithms.inertial.imu_sample import (
+    LONGEST_INTERVAL,
+    SampleClock,
+    heading_of,
+    required_orientation,
+    world_acceleration,
+)
+from caneflow.algorithms.inertial.standing import StandingDetector, StandingSettings
+from caneflow.algorithms.quantities import Density, Factor, Fraction, Length, Offset, Speed, Time, TurnRate, Zero
+from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized, rotate
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaneFilterSettings:
+    """What the filter may be told; units on each line."""
+
+    # s over which radar velocities err alike (their window, and the speckle they stand on): as white noise, those
+    # that come more often are worth less each
+    velocity_correlation: Time = 0.04
+    # m/s, sd of a radar velocity at the least, whatever it states: the best of 20 walks was 0.02
+    velocity_error: Speed = 0.015
+    hole: Time = 0.12  # s between IMU samples, from which on acceleration and turn rate are not interpolated
+    hole_speed: Speed = 0.15  # m/s, sd of what the hand's velocity changes over a hole (estimators.md)
+    hole_speed_time: Time = 0.3  # s in which it changes by that much; as a random walk, over other holes
+    longest_hole: Time = 1.5  # s, from which on the velocity is as unknown as at the start
+    hole_turn: TurnRate = math.radians(1.0)  # rad/s, sd of the rate at which the chip's yaw errs over a hole
+    disagreement: Time = 1.0  # s of outliers alone, after which the radar is believed again
+    speed_noise: Density = 0.5  # m/s, of the paper's speed, where it is all there is (kalman.md)
+    speed_patience: Time = 0.5  # s without a velocity before the paper's speed is taken instead
+    # m/s per sqrt(s), by which the velocity may go astray beside what the filter knows of the accelerometer, while no
+    # radar tells it: the chip's tilt and what the last velocities before a silence had wrong
+    unseen_drift: Speed = 0.1
+    sideways: Speed = 0.1  # m/s, sd of the hand's velocity across the way the cane points
+    sideways_interval: Time = 0.1  # s
+    sideways_memory: Time = 1.0  # s over which swinging and turning are noticed
+    sideways_per_turn: Length | Zero = 0.3  # m: (m/s) of doubt per (rad/s) of swinging or turning
+    hand_ahead: Offset = 0.3  # m that the hand is carried ahead of the body: it goes sideways when the body turns
+    standing_speed: Speed = 0.03  # m/s, sd of the sensors' while the bearer stands
+    standing_inflation: Factor = 20.0  # samples that share one drift of the hand
+    radar_standing: Speed = 0.2  # m/s, radar speed above which nobody stands, whatever the IMU says
+    speed_scale: Fraction | Zero = 0.012  # sd of the radar's scale: 1 cm of height; only in the covariance
+    # What is given out of the horizontal covariance: in 50 simulated walks errors were that much smaller (best.md).
+    covariance_share: Factor = 0.8
+    heading_interval: Time = 0.1  # s between updates of the tracks
+    # s in which the track follows a correction: a person does not jump by millimetres twenty times a second
+    correction_time: Time = 0.3
+    standing: StandingSettings = field(default_factory=StandingSettings)
+    motion: WalkMotionSettings = field(default_factory=WalkMotionSettings)
+    heading: HeadingSettings = field(default_factory=HeadingSettings)
+    heave: HeaveSettings = field(default_factory=HeaveSettings)
+
+
+Floats = NDArray[np.float64]
+
+
+class _Instant(NamedTuple):
+    """What a velocity that comes late is compared with; horizontal vectors are x + jy in the gyro's frame."""
+
+    stamp_ns: int
+    facing: complex  # unit vector, the boresight's projection
+    gained: complex  # m/s, by the accelerometer since the start
+    lever: complex  # m/s, of the antenna about the IMU
+
+
+class _Measured(NamedTuple):
+    stamp_ns: int
+    delay: float  # s
+    forward: float  # m/s
+    left: float  # m/s
+    xx: float  # (m/s)^2
+    yy: float  # (m/s)^2
+
+    @property
+    def of_ns(self) -> int:
+        """The time that it belongs to."""
+        return self.stamp_ns - round(self.delay * 1e9)
+
+
+_HISTORY: Final = 64  # IMU samples that a velocity may come late
+_VERTICAL: Final = 1e-6  # horizontal part of a unit vector, below which it has no direction
+_UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
+_POINTING_TIME: Final = 0.2  # s
+
+
+class CaneFilter:
+    """Ground velocities, magnetic field and IMU samples in, one estimate per IMU sample out."""
+
+    def __init__(
+        self,
+        settings: CaneFilterSettings,
+        *,
+        boresight: Vector,
+        pivot: Vector = (0.0, -0.3, 0.0),
+        antenna: Vector = (0.0, 0.0, 0.0),
+        motion: WalkMotion | None = None,
+    ) -> None:
+        """For a rig: `boresight`, `pivot` (m, IMU to hand) and `antenna` (m, from the IMU), all in the body frame.
+
+        `motion` takes the place of the filter's own, for who wants to look into it (cane_smoother.py).
+        """
+        self._settings = settings
+        self._boresight, self._pivot, self._antenna = boresight, pivot, antenna
+        self._clock = SampleClock()
+        self._yaw = GyroYaw()
+        self._standing = StandingDetector(settings.standing)
+        self._pointing = _Pointing(settings.sideways_memory)
+        self._motion = motion or WalkMotion(settings.motion)
+        self.heading = HeadingHypotheses(settings.heading)
+        self._heave = HeaveObserver(settings.heave)
+        self._start_height: float | None = None  # m, None before the first sample
+        self._waiting: deque[_Measured] = deque(maxlen=16)
+        self._history: deque[_Instant] = deque(maxlen=_HISTORY)
+        self._gained = 0j  # m/s since the start
+        self._acceleration = 0j  # m/s^2 in the gyro's frame, of the last sample
+        self._last_velocity_ns: int | None = None
+        self._disagree_ns: int | None = None  # stamp of the first of the outliers that the last velocities were
+        self._arm = self._arm_speed = 0j  # m, m/s in the gyro's frame: from the IMU to the hand, as of the last sample
+        self._turns = _TurnDoubt()
+        self._lonely = False  # the last velocity came after a silence
+        self._sees_left = False  # the last velocity observed its component to the left
+        self._radar_speed = 0.0  # m/s, the last
+        self._field: Vector | None = None  # uT, body
+        self._since_heading = self._since_sideways = 0.0  # s
+        self._correction = 0j  # m in the gyro's frame, by which the track has yet to move
+
+    @property
+    def gaps(self) -> int:
+        """How many intervals between IMU samples were longer than LONGEST_INTERVAL."""
+        return self._clock.gaps
+
+    @property
+    def gyro_bias(self) -> float:
+        """Bias of the gyro about the vertical as the filter has it, rad/s."""
+        return self.heading.bias
+
+    @property
+    def yaw_offset(self) -> float:
+        """The gyro's yaw less the chip's, rad."""
+        return self._yaw.offset
+
+    def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
+        """Take the paper's speed (m/s), which counts only where no velocity comes."""
+        last_ns = self._last_velocity_ns
+        if not valid or (last_ns is not None and stamp_ns - last_ns < self._settings.speed_patience * 1e9):
+            return
+        self._waiting.append(_Measured(stamp_ns, delay or 0.0, speed, 0.0, self._settings.speed_noise**2, math.inf))
+
+    def velocity(
+        self,
+        stamp_ns: int,
+        velocity: tuple[float, float],
+        covariance: tuple[float, float, float],
+        delay: float | None,
+    ) -> None:
+        """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
+        (forward, left), (xx, _, yy) = velocity, covariance
+        # one sample alone that sees the way sideways while it moves is not believed: from the second on it is
+        sees_left, self._sees_left = self._sees_left, yy < _UNOBSERVED
+        if not sees_left and velocity != (0.0, 0.0):
+            yy = _UNOBSERVED
+        if min(xx, yy) < _UNOBSERVED:
+            least = self._settings.velocity_error**2
+            xx, yy = max(xx, least), max(yy, least)
+            last_ns, self._last_velocity_ns = self._last_velocity_ns, stamp_ns
+            since = (stamp_ns - last_ns) * 1e-9 if last_ns is not None else math.inf
+            share = min(since / self._settings.velocity_correlation, 1.0)
+            # the first after a silence may be a wild one, which the next will show; at rest that does no harm
+            was_lonely = self._lonely
+            self._lonely = lonely = since > self._settings.speed_patience and velocity != (0.0, 0.0)
+            if share > 0.0 and (was_lonely or not lonely):
+                self._waiting.append(_Measured(stamp_ns, delay or 0.0, forward, left, xx / share, yy / share))
+
+    def magnetic_field(self, mag: Vector) -> None:
+        """Take the field (uT, body frame) of the IMU sample that comes next."""
+        self._field = mag
+
+    def imu(
+        self,
+        stamp_ns: int,
+        gyro: Vector,
+        accel: Vector | None,
+        orientation: Quaternion | None,
+        linear_accel: Vector | None,
+    ) -> PoseEstimate:
+        """The estimate at `stamp_ns`.
+
+        Raises ValueError without an orientation, without any acceleration, or when time does not go on.
+        """
+        orientation = normalized(required_orientation(orientation, "best"))
+        in_chips_frame = world_acceleration(orientation, accel, linear_accel, "best")
+        elapsed = self._clock.interval(stamp_ns) or 0.0
+        interval = elapsed if elapsed <= min(self._settings.hole, LONGEST_INTERVAL) else 0.0
+        stands = self._standing.update(stamp_ns, gyro, in_chips_frame)
+        self._lift(elapsed, interval, in_chips_frame[2], orientation)
+
+        chip_cos, chip_sin = heading_of(orientation, self._boresight)
+        if elapsed > interval:
+            self._yaw.bridge(elapsed)
+        self._yaw.update(interval, orientation, gyro, chip_cos, chip_sin)
+        turn = cmath.rect(1.0, self._yaw.offset)  # from the chip's frame to the gyro's
+        facing = turn * complex(chip_cos, chip_sin)
+        before = complex(*self._motion.position)
+        acceleration = turn * complex(*in_chips_frame[:2])
+        arm = turn * _horizontal(rotate(orientation, self._pivot))
+        arm_speed = turn * _horizontal(rotate(orientation, _cross(gyro, self._pivot)))
+        if elapsed > interval:
+            self._bridge(stamp_ns, elapsed, arm, arm_speed)
+        else:
+            self._predict(interval, acceleration, facing)
+        self._acceleration, self._arm, self._arm_speed = acceleration, arm, arm_speed
+        moved = complex(*self._motion.position) - before
+        turned = self._pointing.update(interval, cmath.phase(facing))
+        self._remember(stamp_ns, turn, facing, orientation, gyro)
+        self._take_velocities(stamp_ns)
+        self._open_while_unseen(stamp_ns, interval)
+        self._use_gait(interval, stands, turn, orientation, gyro)
+        self._correction += complex(*self._motion.position) - before - moved
+        shown = self._correction * min(elapsed / self._settings.correction_time, 1.0)
+        self._correction -= shown
+
+        self.heading.move(elapsed, turned, moved.real + shown.real, moved.imag + shown.imag)
+        if self._turns.variance > 0.0:
+            self._turns.move(moved + shown)
+        self._see_field(orientation)
+        self._since_heading += elapsed
+        if self._since_heading >= self._settings.heading_interval:
+            self._follow_heading()
+        return self._estimate(orientation)
+
+    def _lift(self, elapsed: float, interval: float, acceleration: float, orientation: Quaternion) -> None:
+        """Up and down; the hand's height is the zero, because only changes of height are given out."""
+        height = -rotate(orientation, self._pivot)[2]
+        if elapsed > interval:
+            self._heave.bridge(elapsed)
+        self._heave.update(interval, acceleration, height)
+        if self._start_height is None:
+            self._start_height = height
+
+    def _predict(self, interval: float, acceleration: complex, facing: complex) -> None:
+        mean = 0.5 * (acceleration + self._acceleration)
+        if interval > 0.0:
+            self._gained += self._motion.predict(interval, (mean.real, mean.imag), facing.real, facing.imag)
+
+    def _bridge(self, stamp_ns: int, elapsed: float, arm: complex, arm_speed: complex) -> None:
+        """Over a hole in the samples the hand goes on at its velocity, and the sensors turn about it."""
+        s = self._settings
+        speed_error = s.hole_speed * math.sqrt(elapsed / s.hole_speed_time)
+        gained = self._arm_speed - arm_speed
+        moved = elapsed * self._arm_speed + self._arm - arm
+        if elapsed <= s.longest_hole:
+            self._motion.bridge(elapsed, moved, gained, speed_error)
+        else:
+            self._motion.coast(elapsed)
+        self._gained += gained
+        variance = (s.hole_turn * elapsed) ** 2
+        self.heading.doubt(variance)
+        self._turns.variance += variance
+        # what the radar measured in the hole belongs to an attitude that nobody knows
+        began_ns = stamp_ns - round(elapsed * 1e9)
+        self._waiting = deque((each for each in self._waiting if each.of_ns <= began_ns), self._waiting.maxlen)
+
+    def _remember(self, stamp_ns: int, turn: complex, facing: complex, orientation: Quaternion, gyro: Vector) -> None:
+        lever = turn * _horizontal(rotate(orientation, _cross(gyro, self._antenna)))
+        self._history.append(_Instant(stamp_ns, facing, self._gained, lever))
+
+    def _take_velocities(self, before_ns: int) -> None:
+        """Correct by what waits with a stamp before this sample's: so the order of delivery does not matter."""
+        while self._waiting and self._waiting[0].stamp_ns < before_ns:
+            measured = self._waiting.popleft()
+            then = self._instant(measured.of_ns)
+            since = self._gained - then.gained - then.lever  # from the antenna's velocity then to the IMU's now
+            if not abs(then.facing) > _VERTICAL:
+                continue  # a boresight that points straight up or down tells no direction
+            facing = then.facing / abs(then.facing)
+            sides = ((facing, measured.forward, measured.xx), (facing * 1j, measured.left, measured.yy))
+            for direction, value, variance in sides:
+                if variance < _UNOBSERVED:
+                    self._observe(measured.stamp_ns, direction, value + (since * direction.conjugate()).real, variance)
+            self._radar_speed = measured.forward
+
+    def _observe(self, stamp_ns: int, direction: complex, value: float, variance: float) -> None:
+        """Correct by the radar. When the filter has called all it says an outlier for long, the filter is wrong."""
+        along = direction.real, direction.imag
+        if self._motion.observe_velocity(along, value, variance) < self._settings.motion.outlier:
+            self._disagree_ns = None
+            return
+        if self._disagree_ns is None:
+            self._disagree_ns = stamp_ns
+        lasting = (stamp_ns - self._disagree_ns) * 1e-9
+        if lasting > self._settings.disagreement:
+            vx, vy = self._motion.velocity
+            self._motion.doubt(abs(value - along[0] * vx - along[1] * vy), lasting)
+            self._motion.observe_velocity(along, value, variance)
+            self._disagree_ns = None
+
+    def _instant(self, stamp_ns: int) -> _Instant:
+        """Between the samples about a time; the oldest kept when that is not as old."""
+        newer = self._history[-1]
+        for older in reversed(self._history):
+            if older.stamp_ns <= stamp_ns:
+                if newer.stamp_ns == older.stamp_ns:
+                    return older
+                share = (stamp_ns - older.stamp_ns) / (newer.stamp_ns - older.stamp_ns)
+                return _Instant(
+                    stamp_ns,
+                    older.facing + share * (newer.facing - older.facing),
+                    older.gained + share * (newer.gained - older.gained),
+                    older.lever + share * (newer.lever - older.lever),
+                )
+            newer = older
+        return newer
+
+    def _open_while_unseen(self, stamp_ns: int, interval: float) -> None:
+        """Trust the velocity less and less while no radar tells it."""
+        last_ns, patience = self._last_velocity_ns, self._settings.speed_patience
+        if last_ns is not None and stamp_ns - last_ns > patience * 1e9 and interval > 0.0:
+            self._motion.doubt(self._settings.unseen_drift * math.sqrt(interval), 0.0)
+
+    def _use_gait(self, interval: float, stands: bool, turn: complex, orientation: Quaternion, gyro: Vector) -> None:
+        """A bearer who stands does not move; one who walks does not move his hand sideways."""
+        settings, motion = self._settings, self._motion
+        self._since_sideways += interval
+        if stands and abs(self._radar_speed) < settings.radar_standing:
+            variance = settings.standing_speed**2 * settings.standing_inflation
+            motion.observe_velocity((1.0, 0.0), 0.0, variance)
+            motion.observe_velocity((0.0, 1.0), 0.0, variance)
+        elif self._since_sideways >= settings.sideways_interval:
+            self._since_sideways = 0.0
+            ahead = cmath.rect(1.0, self._pointing.yaw + motion.pointing)
+            left = ahead * 1j
+            lever = turn * _horizontal(rotate(orientation, _cross(gyro, self._pivot)))
+            hand = complex(*motion.velocity) + lever
+            speed = (hand * ahead.conjugate()).real
+            # the hand's velocity to the left of the way is what a turning body gives it; linear in beta about now
+            value = settings.hand_ahead * self._pointing.rate
+            value -= (lever * left.conjugate()).real + speed * motion.pointing
+            variance = settings.sideways**2 + settings.sideways_per_turn**2 * self._pointing.turning
+            motion.observe_velocity((left.real, left.imag), value, variance, per_pointing=-speed)
+
+    def _see_field(self, orientation: Quaternion) -> None:
+        """Direction of the field in the gyro's frame; without a magnetometer, of what the chip takes for north."""
+        if self._field is None:
+            self.heading.field(self._yaw.offset, from_chip=True)
+            return
+        x, y, _ = rotate(orientation, self._field)
+        self.heading.field(math.atan2(y, x) + self._yaw.offset, from_chip=False)
+        self._field = None
+
+    def _follow_heading(self) -> None:
+        self._since_heading = 0.0
+        biases = self._yaw.level_biases()
+        if biases is not None:
+            self.heading.level_biases(*biases)
+        p = self._motion.covariance
+        self.heading.advance(0.5 * float(p[0, 0] + p[1, 1]))
+
+    def _estimate(self, orientation: Quaternion) -> PoseEstimate:
+        heading = self.heading.heading()
+        turn = cmath.rect(1.0, heading.yaw)
+        velocity = turn * complex(*self._motion.velocity)
+        rise = self._heave.height - (self._start_height or 0.0)
+        settings = self._settings
+        covariance = level_covariance(self._motion.covariance, heading, turn, velocity, settings.speed_scale)
+        if self._turns.variance > 0.0:
+            covariance += self._turns.covariance(turn, velocity)
+        covariance *= settings.covariance_share
+        covariance[2, 2], covariance[5, 5] = self._heave.height_variance, self._heave.rate_variance
+        return PoseEstimate(
+            position=(heading.position.real, heading.position.imag, rise),
+            velocity=(velocity.real, velocity.imag, self._heave.rate),
+            orientation=multiply(from_yaw(self._yaw.offset + heading.yaw), orientation),
+            covariance=covariance,
+        )
+
+
+class _Pointing:
+    """Where the cane points but for its swing: two poles, and how much it swings or turns."""
+
+    def __init__(self, memory: float) -> None:
+        self._memory = memory
+        self._started = False
+        self._last = 0.0
+        self.yaw = 0.0  # rad, unwrapped
+        self.rate = 0.0  # rad/s
+        self.turning = 0.04  # (rad/s)^2, mean square
+
+    def update(self, interval: float, yaw: float) -> float:
+        """Take the boresight's yaw (rad) `interval` s later; returns how far it turned."""
+        if not self._started:
+            self.yaw, self._started = yaw, True
+            self._last = yaw
+        turned = math.remainder(yaw - self._last, 2.0 * math.pi)
+        self._last = yaw
+        if interval > 0.0:
+            pole = 1.0 / _POINTING_TIME
+            off = math.remainder(yaw - self.yaw, 2.0 * math.pi)
+            self.rate += interval * pole * (pole * off - 2.0 * self.rate)
+            self.yaw += interval * self.rate
+            share = min(interval / self._memory, 1.0)
+            self.turning += share * ((turned / interval) ** 2 - self.turning)
+        return turned
+
+
+class _TurnDoubt:
+    """What unknown turns of the gyro's frame (over holes) do to all that comes after them."""
+
+    def __init__(self) -> None:
+        self.variance = 0.0  # rad^2, of their sum
+        self._mean = 0j  # m rad, covariance of the position with that sum, in the gyro's frame
+        self._xx = self._xy = self._yy = 0.0  # m^2, of the position
+
+    def move(self, moved: complex) -> None:
+        """Go on by so much (m, x + jy, in the gyro's frame): a turn moves the end of it across."""
+        across, before = moved * 1j, self._mean
+        self._mean = after = before + self.variance * across
+        both = before + after
+        self._xx += across.real * both.real
+        self._yy += across.imag * both.imag
+        self._xy += 0.5 * (across.real * both.imag + across.imag * both.real)
+
+    def covariance(self, turn: complex, velocity: complex) -> Floats:
+        """Of position and velocity (6, 6), turned by `turn`; `velocity` (m/s) is in R0 already."""
+        rotation = np.array(((turn.real, -turn.imag), (turn.imag, turn.real)))
+        across, mean = velocity * 1j, self._mean * turn
+        v = np.array((across.real, across.imag))
+        covariance = np.zeros((6, 6))
+        covariance[:2, :2] = rotation @ np.array(((self._xx, self._xy), (self._xy, self._yy))) @ rotation.T
+        covariance[3:5, 3:5] = self.variance * np.outer(v, v)
+        covariance[:2, 3:5] = np.outer((mean.real, mean.imag), v)
+        covariance[3:5, :2] = covariance[:2, 3:5].T
+        return covariance
+
+
+def level_covariance(motion: Floats, heading: Heading, turn: complex, velocity: complex, speed_scale: float) -> Floats:
+    """Of position and velocity (6, 6), nothing vertical, given out after a `turn` (cos + j sin) by the heading.
+
+    The filter's `motion` (4, 4), what the headings add, and the radar's scale, of sd `speed_scale`: the heading's
+    error turns the `velocity` (m/s, x + jy), the scale stretches the track.
+    """
+    turned = np.zeros((6, 4))
+    turned[0, 0] = turned[1, 1] = turned[3, 2] = turned[4, 3] = turn.real
+    turned[1, 0] = turned[4, 2] = turn.imag
+    turned[0, 1] = turned[3, 3] = -turn.imag
+    x, y = heading.position.real, heading.position.imag
+    scale, yaw = speed_scale**2, heading.yaw_variance
+    covariance = np.zeros((6, 6))
+    covariance[0, 0] = heading.xx + scale * x * x
+    covariance[1, 1] = heading.yy + scale * y * y
+    covariance[0, 1] = covariance[1, 0] = heading.xy + scale * x * y
+    covariance[3, 3] = yaw * velocity.imag**2
+    covariance[4, 4] = yaw * velocity.real**2
+    covariance[3, 4] = covariance[4, 3] = -yaw * velocity.real * velocity.imag
+    covariance += turned @ motion @ turned.T
+    return covariance
+
+
+def _horizontal(vector: Vector) -> complex:
+    return complex(vector[0], vector[1])
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -1,0 +1,61 @@
+"""Naive inertial navigation: the chip's linear acceleration, turned into R0, integrated twice (cane.md row 14)."""
+
+from dataclasses import dataclass
+
+from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.inertial.imu_sample import SampleClock, required_orientation, world_acceleration
+from caneflow.algorithms.rotations import Quaternion, Vector
+
+
+@dataclass(frozen=True, kw_only=True)
+class NaiveInsSettings:
+    """Nothing to set: that is what makes it naive."""
+
+
+class NaiveIns:
+    """Velocity and position by the trapezium rule; the radar is not used. The reference that drifts (Table I)."""
+
+    def __init__(self, settings: NaiveInsSettings) -> None:
+        self._clock = SampleClock()
+        self._acceleration: Vector = (0.0, 0.0, 0.0)
+        self._velocity: Vector = (0.0, 0.0, 0.0)
+        self._position: Vector = (0.0, 0.0, 0.0)
+
+    @property
+    def gaps(self) -> int:
+        """How many intervals between IMU samples were longer than LONGEST_INTERVAL; integrated like any other."""
+        return self._clock.gaps
+
+    def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
+        """Ground speed is not used."""
+
+    def imu(
+        self,
+        stamp_ns: int,
+        gyro: Vector,
+        accel: Vector | None,
+        orientation: Quaternion | None,
+        linear_accel: Vector | None,
+    ) -> PoseEstimate:
+        """The estimate at `stamp_ns`; starts at rest in the origin; no covariance.
+
+        Raises ValueError without an orientation, without any acceleration, or when time does not go on.
+        """
+        orientation = required_orientation(orientation, "naive_ins")
+        acceleration = world_acceleration(orientation, accel, linear_accel, "naive_ins")
+        interval = self._clock.interval(stamp_ns)
+        if interval is not None:
+            velocity = _trapezium(self._velocity, self._acceleration, acceleration, interval)
+            self._position = _trapezium(self._position, self._velocity, velocity, interval)
+            self._velocity = velocity
+        self._acceleration = acceleration
+        return PoseEstimate(self._position, self._velocity, orientation, None)
+
+
+def _trapezium(integral: Vector, before: Vector, now: Vector, interval: float) -> Vector:
+    half = 0.5 * interval
+    return (
+        integral[0] + half * (before[0] + now[0]),
+        integral[1] + half * (before[1] + now[1]),
+        integral[2] + half * (before[2] + now[2]),
+    )

@@ -1,0 +1,1 @@
+"""What one clock says of another."""

@@ -1,0 +1,270 @@
+"""Attitude from gyro, accelerometer and magnetometer, each used for what it alone knows.
+
+The gyro, less its bias, turns an attitude from sample to sample: exact, and it drifts. In the world so found the
+motion's own acceleration averages out over a few seconds, since nobody speeds up for ever, and what is left of the
+specific force is gravity: it is low-passed *there*, not in the turning body, and the attitude is turned by just so
+much that it points up. Yaw is corrected by the magnetometer alone, and only as far as the field looks undisturbed;
+inclination never is. What has to be corrected again and again is the gyro's bias.
+
+The idea of low-passing in an almost inertial frame is VQF's: D. Laidig, T. Seel, "VQF: Highly accurate IMU
+orientation estimation with bias estimation and magnetic disturbance rejection", Information Fusion 91, 2023. The
+filters here are others: two first-order low passes (so that any interval will do), a scalar Kalman filter for yaw.
+
+World: x east, y magnetic north, z up.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from caneflow.algorithms.inertial.attitude_recovery import FIELD_ERROR, SMALLEST, Holes, Recovery
+from caneflow.algorithms.inertial.gyro_bias import (
+    NOTHING_SEEN,
+    GyroBias,
+    GyroBiasSettings,
+    RestDetector,
+    Row,
+    followed_row,
+    horizontal_rows,
+    vertical_row,
+)
+from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleClock
+from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, level, required_start
+from caneflow.algorithms.inertial.magnetic_heading import MagneticHeading, MagneticHeadingSettings
+from caneflow.algorithms.quantities import Time
+from caneflow.algorithms.rotations import (
+    Quaternion,
+    Vector,
+    from_rotation_vector,
+    from_yaw,
+    multiply,
+    normalized,
+    rotate,
+)
+
+SETTLING = 6.0  # time constants of a low pass after which its corrections tell of the gyro's bias
+LEAST_FORCE = 1.0  # m/s^2; a mean specific force below is free fall, or no accelerometer
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeFilterSettings:
+    """How long motion is averaged over; the magnetometer; the gyro's bias."""
+
+    inclination_time: Time = 3.0  # s, delay of the low pass of the specific force
+    heading: MagneticHeadingSettings = field(default_factory=MagneticHeadingSettings)
+    bias: GyroBiasSettings = field(default_factory=GyroBiasSettings)
+
+
+class AttitudeFilter:
+    """Raw readings in, attitude out; every reading but the first may lack accelerometer or magnetometer."""
+
+    def __init__(self, settings: AttitudeFilterSettings) -> None:
+        self._clock = SampleClock()
+        self._attitude: Quaternion | None = None  # body to world but for yaw, which the gyro integrates
+        self._gyro: Vector = (0.0, 0.0, 0.0)  # of the sample before
+        self._gravity = _Gravity(0.5 * settings.inclination_time)
+        self._heading = MagneticHeading(settings.heading)
+        self._since_accel = self._since_field = 0.0  # s since the last reading of each
+        self._rest = RestDetector(settings.bias)
+        self._bias = GyroBias(settings.bias)
+        self._holes = Holes()
+        self._recovery: Recovery | None = None  # since the last hole
+
+    @property
+    def gaps(self) -> int:
+        """How many intervals were longer than LONGEST_INTERVAL; after each the attitude starts anew."""
+        return self._clock.gaps
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the last sample was one at rest, when the gyro's bias is learnt."""
+        return self._rest.at_rest
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether the last magnetometer reading was out of tolerance."""
+        return self._heading.disturbed
+
+    @property
+    def bias_sd(self) -> Vector:
+        """rad/s, standard deviation of the gyro's bias per axis of the body."""
+        return self._bias.sd
+
+    def update(self, stamp_ns: int, gyro: Vector, accel: Vector | None, mag: Vector | None = None) -> AttitudeEstimate:
+        """The estimate at `stamp_ns` from a reading in the body frame: rad/s, m/s^2, any unit.
+
+        Raises ValueError when time does not go on, or for a first reading without `accel`.
+        """
+        attitude, interval = self._predicted(stamp_ns, gyro, accel)
+        self._gyro = gyro
+        if self._recovery is None:
+            self._attitude = self._corrected(attitude, gyro, accel, mag, interval)
+            return AttitudeEstimate(self._with_yaw(self._attitude), self._bias.bias)
+        self._attitude = attitude
+        found = self._found(self._recovery, attitude, gyro, accel, mag, interval)
+        return AttitudeEstimate(self._with_yaw(found), self._bias.bias)
+
+    def _predicted(self, stamp_ns: int, gyro: Vector, accel: Vector | None) -> tuple[Quaternion, float]:
+        """The attitude by the gyro alone, and the s over which it was integrated."""
+        if self._attitude is None:
+            start = level(required_start(accel, "attitude_filter"))
+            self._clock.interval(stamp_ns)
+            return start, 0.0
+        interval = self._clock.interval(stamp_ns)
+        assert interval is not None  # the clock has had its first stamp
+        spread = self._holes.spread(interval, gyro, accel)
+        if interval > LONGEST_INTERVAL:
+            self._begin_recovery(spread or math.inf)
+            return self._attitude, 0.0
+        if spread > SMALLEST or (spread > 0.0 and self._recovery is not None):
+            self._begin_recovery(spread)
+            return self._turned(self._attitude, gyro, interval), 0.0
+        return self._turned(self._attitude, gyro, interval), interval
+
+    def _turned(self, attitude: Quaternion, gyro: Vector, interval: float) -> Quaternion:
+        """By the mean of this reading and the one before, less the bias."""
+        bx, by, bz = self._bias.bias
+        ax, ay, az = self._gyro
+        half = 0.5 * interval
+        turn = (
+            half * (ax + gyro[0]) - interval * bx,
+            half * (ay + gyro[1]) - interval * by,
+            half * (az + gyro[2]) - interval * bz,
+        )
+        return normalized(multiply(attitude, from_rotation_vector(turn)))
+
+    def _begin_recovery(self, spread: float) -> None:
+        """What the turn rate may have done in a hole; what was not yet found of the one before adds to it."""
+        if self._recovery is not None:
+            spread = math.hypot(spread, self._recovery.spread)
+            self._end_recovery()
+        self._rest.restart()
+        self._recovery = Recovery(spread, self._holes.speed, self._heading.undisturbed())
+        self._heading.open(spread / FIELD_ERROR)
+
+    def _found(
+        self,
+        recovery: Recovery,
+        attitude: Quaternion,
+        gyro: Vector,
+        accel: Vector | None,
+        mag: Vector | None,
+        interval: float,
+    ) -> Quaternion:
+        """The attitude with what was found of the turn in the hole."""
+        recovery.update(attitude, accel, mag, interval)
+        found = normalized(multiply(recovery.turn, attitude))
+        self._since_field += interval
+        if mag is not None:
+            if not recovery.has_field:
+                row = vertical_row(found, self._bias.bias)
+                self._heading.update(rotate(found, mag), row, gyro, self._since_field, levelled=False)
+            self._since_field = 0.0
+        if recovery.over:
+            self._end_recovery()
+        return found
+
+    def _end_recovery(self) -> None:
+        """The filters of the steady state go on from the rotation that was found."""
+        assert self._recovery is not None
+        assert self._attitude is not None
+        self._attitude = normalized(multiply(self._recovery.turn, self._attitude))
+        self._gravity.restart(self._recovery.force, self._recovery.elapsed)
+        if self._recovery.has_field:
+            self._heading.averaged(self._recovery.elapsed)
+        self._since_accel = self._since_field = 0.0
+        self._recovery = None
+
+    def _corrected(
+        self, attitude: Quaternion, gyro: Vector, accel: Vector | None, mag: Vector | None, interval: float
+    ) -> Quaternion:
+        tilt = turn = None
+        self._since_accel += interval
+        self._since_field += interval
+        if accel is not None:
+            rows = horizontal_rows(attitude, self._bias.bias)
+            correction = self._gravity.update(rotate(attitude, accel), rows, self._since_accel)
+            self._since_accel = 0.0
+            if correction is not None:
+                attitude = multiply(correction, attitude)
+                tilt = 2.0 * correction[1], 2.0 * correction[2]
+        if mag is not None:
+            row = vertical_row(attitude, self._bias.bias)
+            turn = self._heading.update(
+                rotate(attitude, mag), row, gyro, self._since_field, levelled=self._gravity.levelled
+            )
+            self._since_field = 0.0
+        if interval > 0.0:
+            self._learn_bias(gyro, accel, tilt, turn, interval)
+        return attitude
+
+    def _learn_bias(
+        self,
+        gyro: Vector,
+        accel: Vector | None,
+        tilt: tuple[float, float] | None,
+        turn: float | None,
+        interval: float,
+    ) -> None:
+        if accel is not None and self._rest.update(gyro, accel, interval):
+            self._bias.at_rest(gyro, self._rest.deviation, interval)
+        if not self._gravity.settled:
+            tilt = None
+        self._bias.corrected(tilt, self._gravity.rows, turn, self._heading.row, interval)
+
+    def _with_yaw(self, attitude: Quaternion) -> Quaternion:
+        return normalized(multiply(from_yaw(self._heading.offset), attitude))
+
+
+class _Gravity:
+    """The specific force behind two first-order low passes, in a world that is turned until it points up."""
+
+    def __init__(self, time_constant: float) -> None:
+        self._time_constant = time_constant  # s, of each
+        self.restart()
+
+    def restart(self, force: Vector | None = None, elapsed: float = 0.0) -> None:
+        """Take `force`, a mean over `elapsed` s, or the next as it is; from there the mean, while that is younger."""
+        self._once: Vector | None = force
+        self._twice: Vector = force or (0.0, 0.0, 0.0)
+        self._rows_once = self.rows = (NOTHING_SEEN, NOTHING_SEEN)
+        self._elapsed = elapsed  # s
+
+    @property
+    def levelled(self) -> bool:
+        """Whether most of an error of the start is gone."""
+        return self._elapsed > 2.0 * self._time_constant
+
+    @property
+    def settled(self) -> bool:
+        """Whether what is corrected is no longer an error of the start."""
+        return self._elapsed > SETTLING * self._time_constant
+
+    @staticmethod
+    def usable(force: Vector) -> bool:
+        """Whether a force has a direction; one in free fall has none."""
+        return force[0] ** 2 + force[1] ** 2 + force[2] ** 2 > LEAST_FORCE**2
+
+    def update(self, force: Vector, rows: tuple[Row, Row], interval: float) -> Quaternion | None:
+        """The turn that keeps gravity up; None for the first force, and where nothing tells what is up."""
+        if self._once is None:
+            self._once = self._twice = force
+            return None
+        self._elapsed += interval
+        share = interval / (min(self._time_constant, self._elapsed) + interval)
+        once = _followed(self._once, force, share)
+        twice = _followed(self._twice, once, share)
+        (x_row, y_row), (x_once, y_once) = self.rows, self._rows_once
+        x_once, y_once = followed_row(x_once, rows[0], share), followed_row(y_once, rows[1], share)
+        self._rows_once = x_once, y_once
+        self.rows = followed_row(x_row, x_once, share), followed_row(y_row, y_once, share)
+        if not self.usable(twice):
+            self._once, self._twice = once, twice
+            return None
+        correction = level(twice)
+        self._once, self._twice = rotate(correction, once), rotate(correction, twice)
+        return correction
+
+
+def _followed(value: Vector, target: Vector, share: float) -> Vector:
+    x, y, z = value
+    return x + share * (target[0] - x), y + share * (target[1] - y), z + share * (target[2] - z)

@@ -1,0 +1,291 @@
+"""The short-time power spectrum of a continuous-wave Doppler module's output, and the noise under it.
+
+A line of amplitude A (full scale = 1) has the power A^2 in its bin, whatever the window, so spectra of different
+windows and of real and complex modules compare. The noise floor is learnt per bin, so that lamp hum and 1/f noise
+are part of it: the smallest value that the smoothed spectrum has had for a while, as a person who walks does not
+stay on one frequency (minimum statistics: R. Martin, IEEE Trans. Speech and Audio Processing 9(5), 2001).
+
+A window in which the channel, or one of I and Q, stands still for a whole period of the lowest frequency is silent:
+it has no spectrum, and the floor learns nothing from it. Single impulses and steps are taken out before the transform.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated, TypeAlias
+
+import numpy as np
+from annotated_types import Ge, Le
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from caneflow.algorithms.glitches import JumpGate
+from caneflow.algorithms.quantities import Frequency, Time, Zero
+from caneflow.algorithms.radar.waveform_faults import mended
+
+INT16_FULL_SCALE = 32768.0
+SMOOTHING = 0.95  # per hop, of the spectrum whose minimum is taken: 1 s at the hop of 50 ms
+FLOOR_BIAS = 0.565  # that minimum over 20 s of white noise, relative to its mean; a test simulates it
+QUARTILE = 0.288  # lower quartile of one spectrum of white noise, relative to its mean: ln(4/3)
+SETTLING = 20  # spectra before the first minimum is taken
+REFRESH = 4  # spectra between two looks at the minima
+PARTS = 8  # of the memory; the oldest is forgotten as a whole
+BROAD = 21  # bins, 40 Hz; a line fills 4
+SMEAR = 30.0  # over the lower quartile of the floor, 15 dB: as much as 1/f noise may rise at the low end
+LEAST_POWER = 1e-16  # of full scale: far below the last bit of any converter
+# What drifts or settles slowly has most of its power below the band. Of an exponential, and of a straight line, a Hann
+# window lets at most -19 dB of it through beyond 2.4 cells, and 18 dB an octave less farther off (worked out for time
+# constants above 0.1 s; the window's own side lobes: F. Harris, Proc. IEEE 66(1), 1978).
+LEAK = 10.0**-1.8
+LEAK_FROM = 2.4  # cells, 1 / window
+LARGEST_WINDOW = 1 << 20  # samples: 5 s of a sound card's 192 kHz
+FORGOTTEN = 1.0  # s without a block, after which one of another make is believed at once
+
+Make: TypeAlias = tuple[float, float, bool]  # sample rate and carrier (Hz), I and Q: the same in all blocks
+
+
+@dataclass(frozen=True, kw_only=True)
+class DopplerSpectrumSettings:
+    """Window, hop, band (room.md row 8), and how long the floor's minimum looks back."""
+
+    window: Annotated[float, Ge(1e-3), Le(60)] = 0.256  # s, Hann
+    hop: Annotated[float, Ge(1e-3), Le(60)] = 0.05  # s between spectra; a block that is longer gives one all the same
+    padding: Annotated[float, Ge(1), Le(64)] = 2.0  # length of the transform in windows
+    lowest: Frequency | Zero = 8.0  # Hz
+    highest: Frequency = 560.0  # Hz
+    floor_memory: Time = 20.0  # s
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DopplerSpectrum:
+    """Power of one window in the band."""
+
+    frequencies: NDArray[np.float64]  # shape (B,), Hz, increasing; positive is approaching, negative only if signed
+    power: NDArray[np.float64]  # shape (B,), squared amplitude of a line on that frequency, full scale = 1
+    floor: NDArray[np.float64]  # shape (B,), the mean power that noise alone has there
+    signed: bool  # whether the module tells approaching from receding
+    carrier: float  # Hz
+    noise_bandwidth: float  # bins that one line's power is spread over: sum of `power` / noise_bandwidth = energy
+    leak: NDArray[np.float64]  # shape (B,), the most power that what lies below the band may show there
+    silent: bool  # the channel carried nothing; `power` is 0
+
+
+class SlidingSpectrum:
+    """Takes blocks of samples; gives one spectrum per hop once a whole window is there."""
+
+    def __init__(self, settings: DopplerSpectrumSettings) -> None:
+        if settings.lowest >= settings.highest:
+            raise ValueError(f"the band is {settings.lowest:g} to {settings.highest:g} Hz; it has no width")
+        self._settings = settings
+        self._make: Make | None = None
+        self._makes: JumpGate[Make] = JumpGate(0.0, apart, longest_gap=FORGOTTEN)
+        self._last_ns: int | None = None  # stamp of the last block
+        self._seen_ns: int | None = None  # the same, of one that was refused as well
+        self.gaps = 0  # how many times samples were missing between blocks
+
+    @property
+    def delay(self) -> float:
+        """Seconds by which a spectrum lags the stamp of its last sample: half the window."""
+        return 0.5 * self._settings.window
+
+    def update(
+        self, stamp_ns: int, samples: NDArray[np.number], sample_rate: float, carrier: float
+    ) -> DopplerSpectrum | None:
+        """The spectrum of the window that ends with this block; None between hops and until there is a window.
+
+        Args:
+            stamp_ns: of the last of the samples.
+            samples: shape (n,), int16 (full scale 32768), or float or complex (full scale 1).
+            sample_rate: Hz.
+            carrier: Hz.
+
+        A block of another make than the ones before, for three blocks in a row at most, is one by mistake: where its
+        stamp fits its samples at the rate before, it is taken for one of that make, otherwise it counts as lost.
+
+        Raises:
+            ValueError: a block that is not newer than the one before, or a rate that cannot hold the band or takes too
+                long a window; nothing has changed then.
+        """
+        if self._last_ns is not None and stamp_ns <= self._last_ns:
+            raise ValueError(f"block at {stamp_ns} ns is not newer than the last, {self._last_ns} ns")
+        make = (sample_rate, carrier, samples.dtype.kind == "c")
+        elapsed_ns = stamp_ns - (self._seen_ns or 0)
+        impossible = self._impossible(sample_rate)
+        if not impossible:
+            believed = self._makes.update(stamp_ns, make)
+        elif self._make is not None and _fits(self._make, samples, elapsed_ns):
+            believed = self._make
+        else:
+            raise ValueError(impossible)
+        self._seen_ns = stamp_ns
+        if believed != make and not _fits(believed, samples, elapsed_ns):
+            return None
+        if believed != self._make:
+            self._prepare(believed)
+        self._forget_over_gap(stamp_ns, len(samples))
+        self._last_ns = stamp_ns
+        self._take(samples)
+        due = self._since_hop >= self._hop
+        self._since_hop %= self._hop
+        return self._spectrum() if due and self._filled == len(self._kept) else None
+
+    def _impossible(self, sample_rate: float) -> str:
+        """What is wrong with a rate; empty when nothing is."""
+        settings = self._settings
+        if 2.0 * settings.highest > sample_rate:
+            return f"a band up to {settings.highest:g} Hz takes more than {sample_rate:g} samples a second"
+        if settings.window * sample_rate > LARGEST_WINDOW:
+            return f"a window of {settings.window:g} s at {sample_rate:g} Hz has more than {LARGEST_WINDOW} samples"
+        return ""
+
+    def _prepare(self, make: Make) -> None:
+        settings = self._settings
+        sample_rate, _, signed = make
+        count = round(settings.window * sample_rate)
+        self._make = make
+        self._kept = np.zeros(count, dtype=np.complex128 if signed else np.float64)
+        self._filled = 0
+        # whatever is in the band changes within its period; a band that begins at 0 has no longest one
+        self._longest_still = round(min(sample_rate / max(settings.lowest, 1e-9), 0.5 * count))
+        self._hop = max(round(settings.hop * sample_rate), 1)
+        self._since_hop = 0
+        self._hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(count) / count)
+        self._length = fft.next_fast_len(round(settings.padding * count), real=not signed)
+        frequencies = fft.fftfreq(self._length, 1.0 / sample_rate)
+        if not signed:
+            frequencies = np.abs(frequencies[: self._length // 2 + 1])
+        order = np.argsort(frequencies, kind="stable")
+        in_band = (np.abs(frequencies) >= settings.lowest) & (np.abs(frequencies) <= settings.highest)
+        self._bins = order[in_band[order]]
+        self._frequencies = frequencies[self._bins]
+        self._below = np.flatnonzero((np.abs(frequencies) > 0.0) & (np.abs(frequencies) < settings.lowest))
+        cells = np.maximum(np.abs(self._frequencies) * settings.window, LEAK_FROM)
+        self._leak = LEAK * (LEAK_FROM / cells) ** 6
+        # a real line is half at its frequency and half at the negative of it
+        self._scale = ((1.0 if signed else 2.0) / self._hann.sum()) ** 2
+        # Parseval: a line of power 1 gives this in sum over the bins of its lobe
+        self._noise_bandwidth = self._length * float((self._hann**2).sum()) / float(self._hann.sum()) ** 2
+        self._floor = NoiseFloor(max(round(settings.floor_memory / settings.hop), 1))
+
+    def _forget_over_gap(self, stamp_ns: int, count: int) -> None:
+        """Start the window anew where samples are missing; half a block of jitter is none."""
+        if self._make is None or self._last_ns is None:
+            return
+        elapsed = (stamp_ns - self._last_ns) * 1e-9 * self._make[0]  # samples
+        if elapsed > count + _jitter(count):
+            self.gaps += 1
+            self._filled = self._since_hop = 0
+
+    def _take(self, samples: NDArray[np.number]) -> None:
+        scaled = samples / INT16_FULL_SCALE if samples.dtype.kind == "i" else samples
+        size = len(self._kept)
+        fresh = scaled[-size:]
+        self._kept[: size - len(fresh)] = self._kept[len(fresh) :].copy()
+        self._kept[size - len(fresh) :] = fresh
+        self._filled = min(self._filled + len(samples), size)
+        self._since_hop += len(samples)
+
+    def _spectrum(self) -> DopplerSpectrum:
+        assert self._make is not None
+        _, carrier, signed = self._make
+        samples, still = self._mended(signed)
+        silent = still >= self._longest_still
+        power, below = np.zeros(len(self._bins)), 0.0
+        if not silent:
+            windowed = (samples - samples.mean()) * self._hann
+            transform = fft.fft(windowed, self._length) if signed else fft.rfft(windowed, self._length)
+            power = self._power(transform[self._bins])
+            below = float(self._power(transform[self._below]).max(initial=0.0))
+        return DopplerSpectrum(
+            frequencies=self._frequencies,
+            power=power,
+            floor=np.full(len(power), LEAST_POWER) if silent else self._floor.update(power),
+            signed=signed,
+            carrier=carrier,
+            noise_bandwidth=self._noise_bandwidth,
+            leak=below * self._leak,
+            silent=silent,
+        )
+
+    def _power(self, lines: NDArray[np.complex128]) -> NDArray[np.float64]:
+        power: NDArray[np.float64] = self._scale * (lines.real**2 + lines.imag**2)
+        return power
+
+    def _mended(self, signed: bool) -> tuple[NDArray[np.inexact], int]:
+        """The window without impulses and steps, and how long its channel, or the quieter of I and Q, stood still."""
+        if not signed:
+            return mended(self._kept.real)
+        in_phase, quadrature = mended(self._kept.real), mended(self._kept.imag)
+        return in_phase.samples + 1j * quadrature.samples, max(in_phase.still, quadrature.still)
+
+
+class NoiseFloor:
+    """Per bin the minimum of the smoothed power over the last `memory` spectra.
+
+    Somebody who walks for long at one speed leaves a broad rise, which is taken off. Until there has been time for a
+    minimum, a line that stands would be taken for noise; so at first no floor is further above the quieter bins' than
+    1/f noise may be.
+    """
+
+    def __init__(self, memory: int) -> None:
+        self._part = max(memory // PARTS, SETTLING)  # spectra per part
+        self._minima: deque[NDArray[np.float64]] = deque(maxlen=PARTS)
+        self._smooth: NDArray[np.float64] | None = None
+        self._floor: NDArray[np.float64] | None = None
+        self._count = 0
+
+    def update(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The floor, shape (B,), after one more spectrum of shape (B,)."""
+        self._count += 1
+        if self._smooth is None:
+            self._smooth = power.copy()
+        else:  # at first the plain mean: a single spectrum has zeros
+            self._smooth += max(1.0 - SMOOTHING, 1.0 / self._count) * (power - self._smooth)
+        if self._count <= SETTLING:
+            highest = SMEAR * _lower_quartile(power) / QUARTILE
+            return self._raised(np.minimum(self._smooth, highest))
+        if (self._count - SETTLING - 1) % self._part == 0:
+            self._minima.append(self._smooth.copy())
+        else:
+            np.minimum(self._minima[-1], self._smooth, out=self._minima[-1])
+        if self._count % REFRESH == 0 or self._floor is None:
+            self._floor = self._found()
+        return self._floor
+
+    def _found(self) -> NDArray[np.float64]:
+        floor = np.asarray(np.min(self._minima, axis=0), dtype=np.float64) / FLOOR_BIAS
+        if self._count <= self._part:
+            np.minimum(floor, SMEAR * _lower_quartile(floor), out=floor)
+        return self._raised(self._without_smear(floor))
+
+    @staticmethod
+    def _without_smear(floor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What is both broad and far above the quiet bins is a person who walked on and on; hum is narrow."""
+        broad = ndimage.median_filter(floor, size=BROAD, mode="nearest")
+        highest = SMEAR * _lower_quartile(floor)
+        return np.asarray(floor * np.minimum(1.0, highest / np.maximum(broad, LEAST_POWER)), dtype=np.float64)
+
+    @staticmethod
+    def _raised(floor: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.maximum(floor, LEAST_POWER)
+
+
+def _lower_quartile(values: NDArray[np.float64]) -> float:
+    at = len(values) // 4
+    return float(np.partition(values, at)[at])
+
+
+def apart(one: Make, other: Make) -> float:
+    """0 for the same make, 1 for another."""
+    return float(one != other)
+
+
+def _jitter(count: float) -> float:
+    """By how many samples the stamp of a block of `count` may be off: half a block."""
+    return 0.5 * count + 1.0
+
+
+def _fits(make: Make, samples: NDArray[np.number], elapsed_ns: int) -> bool:
+    """Whether samples may be of `make`, by their kind and the time since the block before."""
+    sample_rate, _, signed = make
+    elapsed, count = elapsed_ns * 1e-9 * sample_rate, len(samples)
+    return signed == (samples.dtype.kind == "c") and abs(elapsed - count) <= _jitter(min(elapsed, count))

@@ -1,0 +1,1 @@
+"""Where a person in a room is: particle filters and a Kalman filter on Doppler targets, and their calibration."""
