@@ -17,13 +17,18 @@ from hypothesis.extra import numpy as hnp
 from caneflow.messages import (
     MAX_PAYLOAD,
     SAMPLES,
+    Cue,
     DopplerBlock,
     DopplerTarget,
+    Grid,
     GroundSpeed,
     Imu,
     MessageError,
+    Obstacles,
     Pose,
     RadarFrame,
+    RadarTargets,
+    Ranges,
     Sample,
     control_key,
     decode,
@@ -71,6 +76,27 @@ EXAMPLES: list[Sample] = [
     DopplerTarget(
         stamp=12, range_rate=-1.2, signed=True, amplitude=0.01, snr=20.0, valid=True, range=4.0, delay=0.128
     ),
+    Ranges(
+        stamp=13, ranges=np.array([1.5, 0.0], np.float32), status=np.array([0, 1], np.uint8),
+        sigma=np.array([0.02, 0.0], np.float32), signal=np.array([900.0, 3.0], np.float32),
+        ambient=np.array([4.0, 4.0], np.float32), exposure=0.066, delay=0.033,
+    ),
+    RadarTargets(stamp=14),
+    RadarTargets(
+        stamp=14, range=np.array([1.2], np.float32), range_rate=np.array([-0.8], np.float32),
+        snr=np.array([12.0], np.float32), above_floor=np.array([1], np.uint8),
+    ),
+    Grid(
+        stamp=15, occupancy=np.full((8, 4, 6), 128, np.uint8), unit=1 / 32, cell=0.1, bottom=0.0, slice=0.25,
+        origin=(-32, 4), pose_stamp=14, floor_missing=np.full((4, 6), 90, np.uint8),
+    ),
+    Obstacles(
+        stamp=16, heading=-1.2, walking=True, nearest=np.zeros((3, 4), np.float32), known=np.ones((3, 4), np.float32),
+        closing=np.zeros((3, 4), np.float32), place=np.zeros((3, 4, 2), np.float32),
+    ),
+    Cue(stamp=17, kind="none", since=17),
+    Cue(stamp=18, kind="obstacle", level="head", distance=1.9, azimuth=-0.1, urgency=0.4, time=2.1, since=17),
+    Cue(stamp=19, kind="blind", reason="tof_up/ranges", since=18),
 ]  # fmt: skip
 
 

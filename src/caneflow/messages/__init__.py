@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from caneflow.messages.radar import DopplerBlock, DopplerTarget, RadarFrame
     from caneflow.messages.registry import SAMPLES
     from caneflow.messages.sample import Sample
+    from caneflow.messages.surroundings import Cue, Grid, Obstacles, RadarTargets, Ranges
 
 __all__ = [
     "MAX_PAYLOAD",
@@ -18,13 +19,18 @@ __all__ = [
     "NAME",
     "NAME_RULE",
     "SAMPLES",
+    "Cue",
     "DopplerBlock",
     "DopplerTarget",
+    "Grid",
     "GroundSpeed",
     "Imu",
     "MessageError",
+    "Obstacles",
     "Pose",
     "RadarFrame",
+    "RadarTargets",
+    "Ranges",
     "Sample",
     "control_key",
     "decode",
@@ -45,6 +51,7 @@ ROOMS = {
     "SAMPLES": "registry",
     **dict.fromkeys(("Imu", "GroundSpeed", "Pose"), "motion"),
     **dict.fromkeys(("RadarFrame", "DopplerBlock", "DopplerTarget"), "radar"),
+    **dict.fromkeys(("Ranges", "RadarTargets", "Grid", "Obstacles", "Cue"), "surroundings"),
 }
 
 

@@ -50,6 +50,16 @@ RANGE_RATE = 1000.0  # m/s: three times the speed of sound
 SNR = 400.0  # dB: more than the largest float32 over the last bit of 24
 TARGET_RANGE = 1e6  # m: as RANGE_START
 
+RANGE = 1e4  # m along a ray: the farthest laser range finders in the hand end at 10 km
+LIGHT = 1e9  # of a range sensor's signal and ambient light, in its units: counts of 30 bits
+LOG_ODDS = (1e-6, 100.0)  # nat per count: a thousand counts to see a difference; one count that settles everything
+CELL_SIZE = (1e-3, 100.0)  # m: finer than any range sensor; coarser than any room
+HEIGHT = 1e4  # m above the floor: no sensor looks farther
+CELL_INDEX = 2**40  # cells of a millimetre, 27 times round the earth
+BEARING = 100.0  # rad: sixteen turns; a walking direction may be unwrapped
+AZIMUTH = 1.5708  # rad: a quarter turn to either side, rounded up
+CONTACT = 1e5  # s: the farthest range at the slowest approach
+
 
 def _within(least: float, most: float) -> Meta:
     """The bounds as a JSON Schema says them; `require_within` and its like check them, in words of their own."""
@@ -79,6 +89,15 @@ Amplitude: TypeAlias = Annotated[float, _within(0.0, AMPLITUDE)]
 RangeRate: TypeAlias = Annotated[float, _within(-RANGE_RATE, RANGE_RATE)]
 Snr: TypeAlias = Annotated[float, _within(-SNR, SNR)]
 TargetRange: TypeAlias = Annotated[float, _within(0.0, TARGET_RANGE)]
+LogOdds: TypeAlias = Annotated[float, _within(*LOG_ODDS)]
+CellSize: TypeAlias = Annotated[float, _within(*CELL_SIZE)]
+Height: TypeAlias = Annotated[float, _within(-HEIGHT, HEIGHT)]
+CellIndex: TypeAlias = Annotated[int, _within(-CELL_INDEX, CELL_INDEX)]
+Bearing: TypeAlias = Annotated[float, _within(-BEARING, BEARING)]
+Azimuth: TypeAlias = Annotated[float, _within(-AZIMUTH, AZIMUTH)]
+Distance: TypeAlias = Annotated[float, _within(0.0, RANGE)]
+Share: TypeAlias = Annotated[float, _within(0.0, 1.0)]
+Contact: TypeAlias = Annotated[float, _within(0.0, CONTACT)]
 
 
 def require_within(name: str, value: float, least: float, most: float, unit: str = "") -> None:

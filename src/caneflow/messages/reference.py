@@ -37,6 +37,8 @@ def _type(spec: dict[str, Any]) -> str:
     for alternative in spec.get("anyOf", ()):
         if alternative.get("type") != "null":
             return _type(alternative)
+    if "enum" in spec:
+        return "one of " + ", ".join(word for word in spec["enum"] if word is not None)
     match spec.get("type"):
         case "array":
             return f"[{spec['minItems']}] of {_type(spec['prefixItems'][0])}"

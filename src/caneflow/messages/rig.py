@@ -1,10 +1,10 @@
 """The rig: what is bolted on, as opposed to what flows. One map, for every node and in every recording."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from annotated_types import Ge, Le
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from caneflow.messages.errors import MessageError
 
@@ -13,6 +13,8 @@ from caneflow.messages.errors import MessageError
 Component: TypeAlias = Annotated[float, Ge(-10), Le(10)]  # of a direction: its norm is looked at after that
 Lever: TypeAlias = Annotated[float, Ge(-10), Le(10)]  # m
 Place: TypeAlias = Annotated[float, Ge(-1e4), Le(1e4)]  # m, R0
+FieldOfView: TypeAlias = Annotated[float, Ge(1e-3), Le(3.15)]  # rad
+Reach: TypeAlias = Annotated[float, Ge(0), Le(1e4)]  # m
 Direction: TypeAlias = tuple[Component, Component, Component]
 Levers: TypeAlias = tuple[Lever, Lever, Lever]
 Area: TypeAlias = tuple[Place, Place, Place, Place]
@@ -40,6 +42,47 @@ class Start(BaseModel):
     sd: Annotated[float, Field(ge=1e-3, le=1e4, description="m")]
 
 
+class Ranger(BaseModel):
+    """One range sensor on the cane: where it sits, and where its zones look."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    position: Annotated[Levers, Field(description="m from the IMU, body frame")]
+    boresight: Annotated[Direction, Field(description="unit vector of its axis, body frame")]
+    up: Annotated[Direction, Field(description="unit vector at right angles to it: up as the sensor looks out")]
+    rows: Annotated[int, Field(ge=1, le=64, description="zones one above the other")]
+    columns: Annotated[int, Field(ge=1, le=64, description="zones side by side")]
+    field: Annotated[tuple[FieldOfView, FieldOfView], Field(description="rad over the rows, over the columns")]
+    reach: Annotated[tuple[Reach, Reach], Field(description="m, nearest and farthest")]
+    kind: Annotated[Literal["tof", "sonar"], Field(description="light or sound")] = "tof"
+
+    @field_validator("boresight", "up")
+    @classmethod
+    def _unit(cls, direction: Direction) -> Direction:
+        return require_direction(direction)
+
+    @model_validator(mode="after")
+    def _sound(self) -> "Ranger":
+        across = sum(x * y for x, y in zip(self.boresight, self.up, strict=True))
+        if abs(across) > 0.01:
+            raise ValueError(f"up is not at right angles to boresight: their product is {across:.3g}, expected 0")
+        if not self.reach[0] < self.reach[1]:
+            raise ValueError(f"reach is {list(self.reach)}; expected the nearest first, then the farthest")
+        return self
+
+
+class User(BaseModel):
+    """The person who holds the cane."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    shoulder: Annotated[float, Field(ge=0.1, le=2, description="m, half the width to keep free")] = 0.35
+    height: Annotated[float, Field(ge=1.3, le=3, description="m, up to which something is in the way")] = 2.0
+    hand: Annotated[
+        tuple[Lever, Lever], Field(description="m, of the hand ahead and to the left of the body's middle")
+    ] = (0.30, -0.08)
+
+
 class Rig(BaseModel):
     """Everything that may be known of a rig; what is not known is None."""
 
@@ -59,13 +102,13 @@ class Rig(BaseModel):
     area: Annotated[Area | None, Field(description="room: xmin, xmax, ymin, ymax, m")] = None
     start: Annotated[Start | None, Field(description="room: the user's guess of the start")] = None
 
+    rangers: Annotated[dict[str, Ranger], Field(description="cane: range sensors by node name")] = {}
+    user: Annotated[User | None, Field(description="who holds the cane; without it an adult, right hand")] = None
+
     @field_validator("boresight")
     @classmethod
     def _unit(cls, boresight: Direction) -> Direction:
-        norm = sum(x * x for x in boresight) ** 0.5
-        if abs(norm - 1) > 1e-3:
-            raise ValueError(f"has norm {norm:.6g}; a direction has 1")
-        return boresight
+        return require_direction(boresight)
 
     def need(self, name: str) -> Any:
         """The value of key `name`; raises MessageError when it is not known."""
@@ -76,6 +119,14 @@ class Rig(BaseModel):
                 f"rig.{name} is not known ({meaning}); write it under rig: in the yaml, or give --rig FILE"
             )
         return value
+
+
+def require_direction(direction: Direction) -> Direction:
+    """The same; raises ValueError unless its norm is 1 within a thousandth."""
+    norm = sum(x * x for x in direction) ** 0.5
+    if abs(norm - 1) > 1e-3:
+        raise ValueError(f"has norm {norm:.6g}; a direction has 1")
+    return direction
 
 
 def read_rig(values: Mapping[str, object]) -> Rig:

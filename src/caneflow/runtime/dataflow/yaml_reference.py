@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from caneflow.messages.rig import Rig, Sensor, Start
+from caneflow.messages.rig import Ranger, Rig, Sensor, Start, User
 from caneflow.runtime.dataflow.validation import Checked
 from caneflow.runtime.dataflow.yaml_shape import (
     FlowShape,
@@ -31,6 +31,8 @@ TABLES: dict[str, type[BaseModel]] = {
     "rig": Rig,
     "sensor": Sensor,
     "start": Start,
+    "ranger": Ranger,
+    "user": User,
 }
 REQUIRED = {"flow": {"flow", "nodes"}, "node": {"run"}}  # besides those that the types cannot do without
 
