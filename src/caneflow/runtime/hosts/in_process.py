@@ -11,18 +11,15 @@ from contextvars import copy_context
 from itertools import islice
 from typing import TypeAlias
 
-from caneflow.messages import MessageError, Sample, decode, encode, with_number
-from caneflow.messages.control import Counters
+from caneflow.messages import Sample
 from caneflow.runtime.building import build
 from caneflow.runtime.deployment import RECORDER_MODULE, Deployment
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.outcome import Outcome, note_losses
 from caneflow.runtime.plan import NodePlan
-from caneflow.runtime.program import Encoded, Operator, Program, Quiet, Sink, Source
+from caneflow.runtime.program import Encoded, Program, Quiet, Source
 from caneflow.runtime.replayed import REPLAYER_MODULE
-from caneflow.runtime.stages.operator_stage import Stage
-from caneflow.runtime.stages.sink_stage import Tap
-from caneflow.runtime.stages.source_stage import Feed
+from caneflow.runtime.stages.group import Group, in_order
 
 Arriving: TypeAlias = tuple[str, str, Sample | Encoded]  # node, port, sample
 
@@ -37,19 +34,14 @@ class InProcess:
         """`programs`: the class of each node of the graph, by name."""
         if not deployment.replay:
             raise DataflowError("--in-process runs on a recording; give --replay REC")
-        self._deployment = deployment
-        self._feeds: dict[str, tuple[Feed, Source]] = {}
-        self._readers: dict[str, Stage | Tap] = {}  # writers before their readers
-        for name in _in_order(deployment.plans):
+        self._group = Group(deployment.plans, received=_at_its_stamp)
+        self._sources: dict[str, Source] = {}
+        for name in in_order(deployment.plans):
             plan = deployment.plans[name]
-            self._add(plan, build(_program(plan, programs), plan))
-        # (node, port) -> who reads it on which port
-        self._wires: dict[tuple[str, str], list[tuple[Stage | Tap, str]]] = {
-            (name, port): [] for name, plan in deployment.plans.items() for port in plan.outputs
-        }
-        for name, reader in self._readers.items():
-            for port, wire in deployment.plans[name].inputs.items():
-                self._wires.setdefault((wire.writer, wire.key.rpartition("/")[2]), []).append((reader, port))
+            built = build(_program(plan, programs), plan)
+            self._group.add(plan, built)
+            if isinstance(built, Source):
+                self._sources[name] = built
 
     def run(self) -> Outcome:
         """Run to the end of the recording; raises KeyboardInterrupt when that is not reached because of a signal."""
@@ -66,10 +58,8 @@ class InProcess:
         except KeyboardInterrupt:
             outcome.interrupted = True
         finally:
-            for reader in self._readers.values():
-                if isinstance(reader, Tap):
-                    reader.finish()
-        outcome.counters = self._counters()
+            self._group.finish()
+        outcome.counters = {counters.node: counters for counters in self._group.counters()}
         if not outcome.interrupted:
             note_losses(outcome)
         return outcome
@@ -78,80 +68,28 @@ class InProcess:
         arriving = self._merged()
         while batch := list(islice(arriving, BATCH)):
             for name, port, sample in batch:
-                self._bring(name, port, sample)
+                self._group.bring(name, port, sample)
             last = batch[-1][2].stamp
-            for feed, _ in self._feeds.values():
+            for feed in self._group.feeds.values():
                 feed.nothing_until(last - 1)
-            self._run_readers()
-        for feed, _ in self._feeds.values():
+            self._handle_what_is_due()
+        for feed in self._group.feeds.values():
             feed.ended = True
-        self._run_readers()
+        self._handle_what_is_due()
 
     def _merged(self) -> Iterator[Arriving]:
         """The samples of all sources in the order of their stamps."""
-        each = [_samples(name, source) for name, (_, source) in self._feeds.items()]
+        each = [_samples(name, source) for name, source in self._sources.items()]
         return heapq.merge(*each, key=_stamp)  # equal stamps: in the order of the nodes
 
-    def _bring(self, name: str, port: str, sample: Sample | Encoded) -> None:
-        """Let a source's sample reach all its readers, decoded once."""
-        feed, _ = self._feeds[name]
-        payload = feed.take(port, sample)
-        readers = self._wires[name, port]
-        if payload is None or not readers:
-            return
-        try:
-            message = decode(payload, feed.outputs[port].plan.kind)
-        except MessageError as error:
-            for reader, at in readers:
-                reader.refuse(at, error)
-        else:
-            self._spread(name, port, message, payload)
+    def _handle_what_is_due(self) -> None:
+        while self._group.step() is not None:
+            pass
 
-    def _spread(self, name: str, port: str, message: Sample, payload: bytes | None = None) -> None:
-        """Hand one sample to all its readers; `payload` are its bytes, where there are any yet."""
-        for reader, at in self._wires[name, port]:
-            if isinstance(reader, Stage):
-                reader.offer(at, message)
-            else:
-                # There is no reception here; the stamp stands for it, so that a run gives the same file again.
-                reader.offer(at, message, payload or encode(message), message.stamp)
 
-    def _run_readers(self) -> None:
-        """Let every node handle what is due; writers come first, so one round is enough."""
-        for name, (feed, _) in self._feeds.items():
-            self._pass_marks(name, feed)
-        for name, reader in self._readers.items():
-            if isinstance(reader, Tap):
-                if reader.ended:
-                    reader.finish()
-                continue
-            while (emitted := reader.step()) is not None:
-                for port, message, seq in emitted:
-                    self._spread(name, port, with_number(message, seq))
-            self._pass_marks(name, reader)
-
-    def _pass_marks(self, name: str, writer: Feed | Stage) -> None:
-        for port, mark in writer.progress().ports.items():
-            for reader, at in self._wires[name, port]:
-                reader.mark(at, mark)
-
-    def _add(self, plan: NodePlan, built: Operator | Source | Sink) -> None:
-        if isinstance(built, Source):
-            self._feeds[plan.node] = (Feed(plan.node, plan.outputs, ordered=built.ordered), built)
-        elif isinstance(built, Sink):
-            self._readers[plan.node] = Tap(plan.node, built, plan.inputs)
-        else:
-            self._readers[plan.node] = Stage(plan.node, built, plan.inputs, plan.outputs)
-
-    def _counters(self) -> dict[str, Counters]:
-        counters = {}
-        for name, (feed, _) in self._feeds.items():
-            sent = {port: out.sent for port, out in feed.outputs.items()}
-            counters[name] = Counters(node=name, inputs={}, outputs=sent, refused=feed.refused, unsent=feed.unsent)
-        for name, reader in self._readers.items():
-            outputs = {} if isinstance(reader, Tap) else {port: out.sent for port, out in reader.outputs.items()}
-            counters[name] = Counters(node=name, inputs=reader.input_counts(), outputs=outputs)
-        return counters
+def _at_its_stamp(node: str, port: str, message: Sample) -> int:
+    """There is no reception here; the stamp stands for it, so that a run gives the same file again."""
+    return message.stamp
 
 
 def _samples(name: str, source: Source) -> Iterator[Arriving]:
@@ -168,13 +106,3 @@ def _program(plan: NodePlan, programs: Mapping[str, Program]) -> Program:
         return programs[plan.node]
     program: Program = getattr(importlib.import_module(str(plan.module)), name)
     return program
-
-
-def _in_order(plans: Mapping[str, NodePlan]) -> list[str]:
-    """The nodes, writers before their readers; the graph has been checked to have no cycle."""
-    done: dict[str, None] = {}
-    while len(done) < len(plans):
-        for name, plan in plans.items():
-            if all(wire.writer in done for wire in plan.inputs.values()):
-                done.setdefault(name)
-    return list(done)
