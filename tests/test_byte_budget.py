@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.test_stage import emitted, imu, stage
 
 from caneflow.messages import DopplerTarget, GroundSpeed, Pose, RadarFrame, Sample, numbered, sample_key
 from caneflow.messages.control import PortMark
@@ -31,6 +30,7 @@ from caneflow.runtime.stages.merge import END
 from caneflow.runtime.stages.sent_samples import History
 from caneflow.runtime.stages.streams import CAUSES_NAMED, LONGEST_CAUSE, Arrivals
 from tests.flows import launchers
+from tests.test_operator_stage import emitted, imu, stage
 
 MB = 10**6
 BARE = 80 * MB  # what a node takes that holds nothing

@@ -46,18 +46,20 @@ LIGHT = {  # where what needs no numpy is, which takes as long to import as all 
     "MessageError": "errors",
     **dict.fromkeys(("NAME", "NAME_RULE", "control_key", "sample_key", "stream_of"), "keys"),
 }
-ROOMS = {
-    "Sample": "sample",
-    "SAMPLES": "registry",
-    **dict.fromkeys(("Imu", "GroundSpeed", "Pose"), "motion"),
-    **dict.fromkeys(("RadarFrame", "DopplerBlock", "DopplerTarget"), "radar"),
-    **dict.fromkeys(("Ranges", "RadarTargets", "Grid", "Obstacles", "Cue"), "surroundings"),
+FAMILIES = {  # the file of each family: what it defines
+    "motion": ("Imu", "GroundSpeed", "Pose"),
+    "radar": ("RadarFrame", "DopplerBlock", "DopplerTarget"),
+    "surroundings": ("Ranges", "RadarTargets", "Grid", "Obstacles", "Cue"),
 }
+ROOMS = LIGHT | {"Sample": "sample"} | {name: family for family, names in FAMILIES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    room = LIGHT.get(name) or ROOMS.get(name, "codec")
+    if name == "SAMPLES":
+        for family in FAMILIES:  # each registers what it defines
+            import_module(f"{__name__}.{family}")
+    room = "registry" if name == "SAMPLES" else ROOMS.get(name, "codec")
     value = globals()[name] = getattr(import_module(f"{__name__}.{room}"), name)
     return value

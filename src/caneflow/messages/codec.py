@@ -32,11 +32,44 @@ def decode(payload: bytes, kind: type[S]) -> S:
         raise MessageError(f"{len(payload)} bytes; at most {MAX_PAYLOAD} are taken")
     try:
         message: S = _decoder(kind).decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MessageError(str(error)) from error
+    except (MessageError, MemoryError):
+        raise
+    except Exception as error:  # of msgspec; or of a check that a user's own message makes of itself
+        raise MessageError(str(error) or type(error).__name__) from error
     if isinstance(message, Sample) and not 0 <= message.seq <= MAX_SEQ:
         raise MessageError(f"seq is {'missing' if message.seq == -1 else message.seq}; it counts 0, 1, 2 ...")
     return message
+
+
+def decode_fields(payload: bytes) -> dict[str, Any]:
+    """The fields of a sample whose type is not known here, as msgpack has them: lists, maps, arrays.
+
+    Raises MessageError unless it is a map with string keys that has what every sample has.
+    """
+    decode(payload, Sample)
+    try:
+        fields: dict[str, Any] = _fields.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise MessageError(str(error)) from error
+    return fields
+
+
+def require_sound(kind: type[Sample]) -> None:
+    """Raise MessageError unless `kind`, of a user's own, can travel as the wire has it."""
+    options = kind.__struct_config__
+    if not kind.schema:
+        raise MessageError(f'{kind.__name__} has no schema; give it one, e.g. schema = "mine.{kind.__name__}/1"')
+    if options.array_like or not {"stamp", "seq"} <= set(kind.__struct_encode_fields__):
+        raise MessageError(f"{kind.__name__} is not a map with stamp and seq; leave out array_like and rename")
+    if not options.frozen or options.forbid_unknown_fields:
+        raise MessageError(
+            f"{kind.__name__} is not frozen, or forbids unknown fields; a message is frozen, and may grow"
+        )
+    try:
+        _decoder(kind)
+        json_schema(kind)
+    except Exception as error:  # msgspec has several ways to say which type it cannot take
+        raise MessageError(f"{kind.__name__} cannot travel: {str(error) or type(error).__name__}") from error
 
 
 def with_number(message: Sample, seq: int) -> Sample:
@@ -52,8 +85,12 @@ def numbered(message: Sample, seq: int) -> bytes:
 
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
     """The JSON Schema of `kind`, self-contained, as stored in recordings and printed by `caneflow schema`."""
-    _, components = msgspec.json.schema_components((kind,), schema_hook=_array_schema)
-    schema = dict(components[kind.__name__])
+    (top,), components = msgspec.json.schema_components(
+        (kind,), schema_hook=_array_schema, ref_template="#/$defs/{name}"
+    )
+    schema = dict(components.pop(top["$ref"].rpartition("/")[2]))
+    if components:  # structs within it
+        schema["$defs"] = components
     schema.update(
         {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -98,4 +135,5 @@ def _array_schema(kind: type) -> dict[str, Any]:
     raise NotImplementedError(kind)
 
 
+_fields = msgspec.msgpack.Decoder(dict[str, Any], ext_hook=_from_ext)
 _encoder = msgspec.msgpack.Encoder(enc_hook=_to_ext)

@@ -6,8 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from caneflow.messages.codec import json_schema
-from caneflow.messages.registry import SAMPLES
+from caneflow.messages import SAMPLES, json_schema
 
 
 def table(name: str) -> str:

@@ -29,6 +29,7 @@ from caneflow.runtime.replayed import (
 )
 from caneflow.runtime.site import Site, door_of, site_of, with_endpoint
 from caneflow.runtime.stages.byte_budget import SENT, share
+from caneflow.runtime.user_files import place_of
 
 RECORDER = "recorder"
 RECORDER_MODULE = "caneflow.tools.record"
@@ -167,6 +168,7 @@ def _plan(graph: Graph, node: Node, nodes: dict[str, Node], left_out: LeftOutSta
         port: InputPlan(
             key=sample_key(graph.flow, wire.node, wire.port),
             schema=wire.kind.schema,
+            kind_at=place_of(wire.kind),
             writer=wire.node,
             length=wire.queue.length,
             max_lag_ms=wire.max_lag_ms,
@@ -204,7 +206,7 @@ def _require_rig(rig: dict[str, Any], replay: Replay | None) -> None:
 def _all_outputs(plans: Mapping[str, NodePlan]) -> dict[str, InputPlan]:
     """What a recorder reads."""
     return {
-        f"{plan.node}/{port}": InputPlan(key=out.key, schema=out.schema, writer=plan.node)
+        f"{plan.node}/{port}": InputPlan(key=out.key, schema=out.schema, kind_at=out.kind_at, writer=plan.node)
         for plan in plans.values()
         for port, out in plan.outputs.items()
     }

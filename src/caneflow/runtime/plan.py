@@ -9,6 +9,7 @@ import msgspec
 from caneflow.messages import SAMPLES, Sample
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.stages.byte_budget import SENT
+from caneflow.runtime.user_files import kind_at
 
 
 class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
@@ -16,6 +17,7 @@ class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     key: str
     schema: str  # of the port's type, e.g. "caneflow.Imu/1"
+    kind_at: str = ""  # where that type is defined: "module:Class" or "/path/file.py:Class". "": one of ours
     writer: str  # the node at the other end
     clock: str = ""  # the machine whose clock its stamps are on, when that is not this one
     length: int | None = None  # how many samples may wait; the oldest is dropped beyond. None: all
@@ -28,7 +30,7 @@ class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     @cached_property
     def kind(self) -> type[Sample]:
         """The type that the port takes."""
-        return SAMPLES[self.schema]
+        return kind_at(self.kind_at) if self.kind_at else SAMPLES[self.schema]
 
     @cached_property
     def left_out_stamps(self) -> frozenset[int]:
@@ -41,6 +43,7 @@ class OutputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     key: str
     schema: str
+    kind_at: str = ""  # where its type is defined, as in InputPlan
     readers: tuple[str, ...] = ()  # the nodes that read it, the recorder among them
     budget: int = SENT  # bytes that may be sent and not yet confirmed by every reader
     awaited: bool = True  # one of them puts it in order with other streams: it waits to hear how far this one has come
@@ -48,7 +51,7 @@ class OutputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     @cached_property
     def kind(self) -> type[Sample]:
         """The type that the port gives."""
-        return SAMPLES[self.schema]
+        return kind_at(self.kind_at) if self.kind_at else SAMPLES[self.schema]
 
 
 class Links(msgspec.Struct, frozen=True, kw_only=True):

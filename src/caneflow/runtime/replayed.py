@@ -13,6 +13,7 @@ from caneflow.recording import Recording
 from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import NodePlan, OutputPlan
+from caneflow.runtime.user_files import place_of
 
 LeftOutStamps: TypeAlias = dict[tuple[str, str], set[int]]  # ns, by node and port
 
@@ -33,7 +34,10 @@ class Replay:
 
 def outputs_of(flow: str, node: str, kinds: dict[str, type[Sample]]) -> dict[str, OutputPlan]:
     """The outputs of a node, by port, with their message types."""
-    return {port: OutputPlan(key=sample_key(flow, node, port), schema=kind.schema) for port, kind in kinds.items()}
+    return {
+        port: OutputPlan(key=sample_key(flow, node, port), schema=kind.schema, kind_at=place_of(kind))
+        for port, kind in kinds.items()
+    }
 
 
 def replayed_plan(

@@ -73,6 +73,9 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
     if document.value.get("nodes", {}) == {}:
         document.problem(("nodes",), "there are none; a flow has at least one node")
     parts = {name: _part(document, name, shape, path.parent) for name, shape in flow.nodes.items()}
+    for name, part in parts.items():
+        if part.shape.external and is_written(document.value, ("nodes", name, "outputs")):
+            part.outputs = external_outputs(document, name, part.shape, path.parent)
     check_wires(document, flow, parts)
     layout = check_machines(document, flow, parts)
     nodes = {name: _node(document, name, part, layout.places[name]) for name, part in parts.items()}
@@ -112,9 +115,7 @@ def _part(document: Document, name: str, shape: NodeShape, base: Path) -> Part:
                 document.problem(
                     (*path, key), "an external node publishes by itself; it has only outputs and machine", key=True
                 )
-        if is_written(document.value, (*path, "outputs")):
-            part.outputs = external_outputs(document, name, shape)
-        else:
+        if not is_written(document.value, (*path, "outputs")):
             document.problem((*path, "outputs"), "is missing; an external node names them, e.g. {imu: Imu}")
         return part
     if is_written(document.value, (*path, "outputs")):

@@ -10,15 +10,16 @@ import traceback
 from collections.abc import Hashable, Mapping
 from contextlib import redirect_stdout, suppress
 from functools import lru_cache
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import ModuleType
 from typing import Any, NamedTuple
 
-from caneflow.messages import NAME, NAME_RULE, Sample
+from caneflow.messages import NAME, NAME_RULE, MessageError, Sample
+from caneflow.messages.codec import require_sound
 from caneflow.runtime.dataflow.validation import Checked, Mistake
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import ANY_PORT, Operator, Program, Sink, Source
+from caneflow.runtime.user_files import OURS, kind_at, module_of, place_of
 from caneflow.runtime.wording import did_you_mean, dotted, listed, one_line, shown
 
 ROOMS = ("drivers", "operators")
@@ -87,6 +88,17 @@ def outputs_of(program: Program) -> Mapping[str, type[Sample]]:
     return {} if issubclass(program, Sink) else program.outputs
 
 
+def require_message(kind: type[Sample]) -> None:
+    """Raise MessageError or DataflowError unless messages of `kind` can travel between processes.
+
+    Sample itself stands for any message.
+    """
+    if kind is not Sample and not kind.__module__.startswith(OURS):
+        require_sound(kind)
+        if kind_at(place_of(kind)) is not kind:
+            raise DataflowError(f"{kind.__qualname__} is not what its file has under that name")
+
+
 def validated_settings(program: Program, settings: Mapping[str, Any]) -> Any:
     """`settings` as the program's Settings; raises DataflowError, one line for each mistake."""
     made, mistakes = check_settings(program, settings)
@@ -117,13 +129,6 @@ def _checked_kind(kind: Hashable) -> Checked[Any]:
     return Checked(kind)
 
 
-class _Fresh(SourceFileLoader):
-    """Compiles the file each time: what is cached may be older than an edit within the same second."""
-
-    def get_code(self, fullname: str) -> CodeType:
-        return self.source_to_code(self.get_data(self.path), self.path)
-
-
 def _file(run: str, base: Path) -> Path:
     file = base / Path(run)
     try:
@@ -147,23 +152,9 @@ def _looked_in() -> str:
 def _imported(where: Located) -> ModuleType:
     try:
         with redirect_stdout(sys.stderr):  # what a program prints is no answer of ours
-            return importlib.import_module(str(where.module)) if where.file is None else _from_file(where.file)
+            return importlib.import_module(str(where.module)) if where.file is None else module_of(where.file)
     except (Exception, SystemExit) as error:  # a program may do anything while it is imported
         raise DataflowError(f"{where.file or where.module} cannot be imported: {_cause(error)}") from error
-
-
-def _from_file(file: Path) -> ModuleType:
-    """The module in a user's file, made anew; its neighbours can be imported from it, as when it is run."""
-    name = f"caneflow_user_{abs(hash(str(file))):x}_{file.stem}"
-    if str(file.parent) not in sys.path:
-        sys.path.append(str(file.parent))
-    spec = importlib.util.spec_from_file_location(name, file, loader=_Fresh(name, str(file)))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # annotations are looked up there
-    spec.loader.exec_module(module)
-    return module
 
 
 def _cause(error: BaseException) -> str:
@@ -198,6 +189,10 @@ def _check_tables(run: str, program: Program) -> None:
                 raise DataflowError(f"{where}: {shown(port)} is no name of a port; that is {NAME_RULE}")
             if not (inspect.isclass(kind) and issubclass(kind, Sample)):
                 raise DataflowError(f"{where}[{shown(port)}] is {shown(kind)}; it takes a class of messages")
+            try:
+                require_message(kind)
+            except (MessageError, DataflowError) as error:
+                raise DataflowError(f"{where}[{shown(port)}]: {error}") from error
     try:
         _checked(program)
     except Exception as error:  # pydantic has a dozen ways to say that it cannot check a type

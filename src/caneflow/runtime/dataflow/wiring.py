@@ -2,16 +2,17 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from caneflow.messages import SAMPLES, Sample
+from caneflow.messages import Sample
 from caneflow.runtime.dataflow.graph import Queue, Wire
+from caneflow.runtime.dataflow.message_names import message_named
 from caneflow.runtime.dataflow.programs import Located, inputs_of
 from caneflow.runtime.dataflow.yaml_file import Document
 from caneflow.runtime.dataflow.yaml_shape import ALL_LENGTH, FlowShape, InputShape, NodeShape, is_written
+from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import ANY_PORT, Operator, Program
 from caneflow.runtime.wording import did_you_mean, listed
-
-MESSAGES = {kind.__name__: kind for kind in SAMPLES.values()} | SAMPLES  # `Imu` and `caneflow.Imu/1`
 
 
 @dataclass(kw_only=True)
@@ -25,18 +26,14 @@ class Part:
     wires: dict[str, Wire] = field(default_factory=dict)
 
 
-def external_outputs(document: Document, name: str, shape: NodeShape) -> dict[str, type[Sample]]:
-    """The outputs of a device that publishes by itself."""
+def external_outputs(document: Document, name: str, shape: NodeShape, base: Path) -> dict[str, type[Sample]]:
+    """The outputs of a device that publishes by itself; all programs of the flow are imported already."""
     outputs = {}
     for port, message in shape.outputs.items():
-        if message in MESSAGES:
-            outputs[port] = MESSAGES[message]
-        else:
-            names = [kind.__name__ for kind in SAMPLES.values()]
-            document.problem(
-                ("nodes", name, "outputs", port),
-                f"no message {message!r};{did_you_mean(message, names)} there are {listed(names)}",
-            )
+        try:
+            outputs[port] = message_named(message, base)
+        except DataflowError as error:
+            document.problem(("nodes", name, "outputs", port), str(error))
     return outputs
 
 
@@ -99,7 +96,7 @@ def _takes(document: Document, parts: Mapping[str, Part], name: str, port: str, 
         has = f"its inputs are {listed(inputs)}" if inputs else "it reads nothing"
         document.problem(path, f"{part.shape.run} has no input {port!r};{did_you_mean(port, inputs)} {has}", key=True)
         return False
-    if kind is not None and not issubclass(kind, takes):
+    if kind is not None and not _fits(kind, takes):
         document.problem(
             path,
             f"{part.shape.inputs[port].source} carries {_named(kind)}, and this input takes {_named(takes)};"
@@ -137,9 +134,14 @@ def _givers(parts: Mapping[str, Part], reader: str, kind: type[Sample]) -> str:
         f"{name}/{port}"
         for name, part in parts.items()
         for port, given in (part.outputs or {}).items()
-        if name != reader and issubclass(given, kind)
+        if name != reader and _fits(given, kind)
     ]
     return f"wire it to {' or '.join(streams)}" if streams else "no node of this flow gives that"
+
+
+def _fits(given: type[Sample], taken: type[Sample]) -> bool:
+    """Whether a port that takes messages of one type takes those of another: by schema, not by class object."""
+    return taken is Sample or given.schema == taken.schema
 
 
 def _named(kind: type[Sample]) -> str:

@@ -149,7 +149,10 @@ class NodeShape(Shape):
     ] = False
     outputs: Annotated[
         dict[Name, str],
-        Field(description="external only: for each port, the message it sends, e.g. `Imu` or `caneflow.Imu/1`"),
+        Field(
+            description="external only: for each port, the message it sends, e.g. `Imu` or `caneflow.Imu/1`; "
+            "of your own `mine.Range/1`, or `./ranges.py:Range`"
+        ),
     ] = {}
     ready_timeout_s: Annotated[
         float, Field(ge=0.1, le=3600, description="s from its start within which the node says that it is ready")

@@ -100,7 +100,7 @@ def verify(graph: Graph, path: Path, *, tolerance: float | None = None) -> Verif
             tolerance = ACROSS_PLATFORMS if differences else 0.0
         comparison = _Comparison(recording, list(outputs), tolerance)
         inputs = {
-            f"{node}/{port}": InputPlan(key=out.key, schema=out.schema, writer=node)
+            f"{node}/{port}": InputPlan(key=out.key, schema=out.schema, kind_at=out.kind_at, writer=node)
             for (node, port), out in outputs.items()
         }
         observer = NodePlan(flow=graph.flow, node=COMPARISON, inputs=inputs, replay=True)

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from caneflow.messages.registry import SAMPLES
 from caneflow.runtime.errors import DataflowError
 
 # Rooms of caneflow whose classes an operator's state may be made of: they do no I/O, so their functions are harmless.
@@ -34,7 +35,7 @@ ROOMS = (
     "caneflow.runtime.program",
     "caneflow.simulation",
 )
-KEEPABLE = "only plain data and classes of the operator's own module or of caneflow can be kept"
+KEEPABLE = "only plain data and classes of the operator's own module, of messages or of caneflow can be kept"
 BUILTINS = (
     "bool int float complex str bytes bytearray list tuple dict set frozenset object "
     "abs all any len max min pow round sorted sum"
@@ -111,13 +112,18 @@ class References:
         return found
 
     def _may_name(self, module: object) -> bool:
-        return module == self._own_module or (isinstance(module, str) and _in_a_room(module))
+        return module == self._own_module or (isinstance(module, str) and (_in_a_room(module) or _has_messages(module)))
 
 
 @lru_cache(maxsize=8)
 def references_of(own_module: str) -> References:
     """The names that snapshots of an operator of `own_module` may hold."""
     return References(own_module)
+
+
+def _has_messages(module: str) -> bool:
+    """Whether it is a file of a user's own messages: an operator may keep the last one."""
+    return any(kind.__module__ == module for kind in SAMPLES.values())
 
 
 def _in_a_room(module: str) -> bool:

@@ -25,6 +25,7 @@ import msgspec
 from setproctitle import setproctitle, setthreadtitle
 
 from caneflow.runtime.hosts.process.last_words import telling_failures
+from caneflow.runtime.user_files import run_as_main
 
 REQUEST_BYTES = 65_536  # of the longest command line
 PR_SET_PDEATHSIG = 1  # of Linux' prctl: the signal for a process whose parent dies
@@ -187,7 +188,7 @@ def _become(arguments: Sequence[str], output: int, plan: int | None = None, *, p
         else:
             sys.argv = list(arguments)
             sys.path.insert(0, str(Path(arguments[0]).parent))
-            runpy.run_path(arguments[0], run_name="__main__")
+            run_as_main(Path(arguments[0]))
 
 
 def _end(work: Callable[[], None]) -> NoReturn:

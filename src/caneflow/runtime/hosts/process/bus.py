@@ -19,6 +19,7 @@ import zenoh
 from caneflow.messages import MEDIA_TYPE, MessageError, control_key, decode, encode
 from caneflow.messages.codec import MAX_SEQ
 from caneflow.messages.control import Again, Clock, Counters, LeftOut, PortMark, Progress, Window
+from caneflow.messages.registry import SCHEMA
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.links.session import KnownThreads, open_session, sending_now, sent_at
 from caneflow.runtime.hosts.process.inbox import Inbox
@@ -500,7 +501,7 @@ def _say_yes(key: str, query: zenoh.Query) -> None:
 def check_schema(arrived: Arrived, wire: InputPlan) -> None:
     """Raise MessageError when the writer said another type than the port takes."""
     # A writer that says no schema (a C client: "zenoh/bytes;application/msgpack") is decoded by the port's type.
-    if arrived.schema.startswith("caneflow.") and arrived.schema != wire.schema:
+    if arrived.schema != wire.schema and SCHEMA.fullmatch(arrived.schema):
         raise MessageError(f"a {arrived.schema} came; the port takes {wire.schema}")
 
 
