@@ -132,7 +132,7 @@ def _to_ext(value: object) -> msgspec.msgpack.Ext:
 def _array_schema(kind: type) -> dict[str, Any]:
     if kind is np.ndarray:
         return {"description": "msgpack ext type 1: dtype letter, rank, uint32 sizes, elements; little-endian"}
-    raise NotImplementedError(kind)
+    raise MessageError(f"the wire has nothing for a {kind.__name__}")
 
 
 _fields = msgspec.msgpack.Decoder(dict[str, Any], ext_hook=_from_ext)

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from caneflow import messages
 from caneflow.messages import NAME, NAME_RULE, MessageError, Sample
 from caneflow.messages.codec import require_sound
 from caneflow.runtime.dataflow.validation import Checked, Mistake
@@ -25,6 +26,7 @@ from caneflow.runtime.wording import did_you_mean, dotted, listed, one_line, sho
 ROOMS = ("drivers", "operators")
 TOOLS = ("tools.view",)  # that are programs of a graph as well
 IN_A_ROOM = re.compile(rf"({'|'.join(ROOMS)})\.[A-Za-z_][A-Za-z0-9_]*")
+NOT_THEIRS = ("<frozen", str(Path(messages.__file__).parent))  # in what users' code calls
 FILES_NAMED = 8  # of a folder without the file that was asked for
 
 
@@ -159,7 +161,7 @@ def _imported(where: Located) -> ModuleType:
 
 def _cause(error: BaseException) -> str:
     """The error and the line of users' code that raised it."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(NOT_THEIRS)]
     where = f" (line {frames[-1].lineno} of {frames[-1].filename})" if frames else ""
     if isinstance(error, SyntaxError):
         where = f" (line {error.lineno} of {error.filename})"
