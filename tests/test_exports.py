@@ -1,5 +1,6 @@
 """What `caneflow export` writes for Foxglove and ROS 2, opened by the libraries of those."""
 
+import csv
 import json
 import math
 import sys
@@ -11,9 +12,9 @@ import numpy as np
 import pytest
 
 from caneflow import command
-from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
+from caneflow.bridges.radar_images import SCANS, RadarImages
+from caneflow.messages import DopplerTarget, GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
 from caneflow.recording import RecordingWriter
-from caneflow.recording.radar_images import SCANS, RadarImages
 
 START = 1_700_000_000_000_000_000  # ns
 TURN = (0.5, 0.5, -0.5, 0.5)  # w x y z
@@ -72,8 +73,13 @@ def samples() -> Iterator[tuple[str, Sample, int]]:
         quality = 0.1 if valid else math.inf
         yield "ground_speed/speed", GroundSpeed(stamp=stamp, speed=0.5, quality=quality, rays=3, valid=valid), seq
         position = (0.01 * seq, -2.0, 0.5)
-        pose = Pose(stamp=stamp, position=position, velocity=(0, 0, 0), orientation=TURN, method="best")
+        spread = np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+        pose = Pose(
+            stamp=stamp, position=position, velocity=(0, 0, 0), orientation=TURN, method="best", covariance=spread
+        )
         yield "fusion/pose", pose, seq
+        target = DopplerTarget(stamp=stamp, range_rate=0.25, signed=True, amplitude=0.1, snr=20.0, valid=True)
+        yield "doppler/target", target, seq
 
 
 @pytest.fixture(scope="module")
@@ -101,86 +107,156 @@ def test_a_map_shows_a_target_at_its_range_and_speed() -> None:
     assert image.grey.max() > 250
 
 
-def test_foxglove_opens_it(caneflow: Callable[..., Run], recording: Path, tmp_path: Path) -> None:
+TOPICS = {  # of ROS messages, with how many there are of each
+    "/imu/imu": ("sensor_msgs/msg/Imu", 100),
+    "/imu/imu/mag": ("sensor_msgs/msg/MagneticField", 100),
+    "/radar/frame": ("sensor_msgs/msg/Image", 4),
+    "/ground_speed/speed/twist": ("geometry_msgs/msg/TwistWithCovarianceStamped", 90),
+    "/fusion/pose": ("geometry_msgs/msg/PoseStamped", 100),
+    "/fusion/pose/odom": ("nav_msgs/msg/Odometry", 100),
+    "/fusion/pose/with_covariance": ("geometry_msgs/msg/PoseWithCovarianceStamped", 100),
+    "/tf": ("tf2_msgs/msg/TFMessage", 100),
+    "/tf_static": ("tf2_msgs/msg/TFMessage", 1),
+}
+
+Found = dict[str, list[tuple[int, Any]]]  # by topic: log time (ns) and message
+
+
+def bag_of(path: Path) -> Found:
+    """The messages of a bag, by rosbags."""
+    highlevel = pytest.importorskip("rosbags.highlevel", reason="rosbags is not installed: caneflow[rosbag2]")
+    found: Found = {}
+    with highlevel.AnyReader([path]) as reader:
+        for connection, stamp, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            assert message.__msgtype__ == connection.msgtype
+            found.setdefault(connection.topic, []).append((stamp, message))
+    return found
+
+
+def foxglove_of(path: Path) -> Found:
+    """The messages of a file for Foxglove, each decoded by the schema that the file holds for it."""
     pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: pip install caneflow[foxglove]")
     protobuf = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
     from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    out = tmp_path / "walk.foxglove.mcap"
-    status, told, err = caneflow("export", recording, "--format", "foxglove", "-o", out)
-    assert (status, err) == (0, "")
-    assert "     100  /fusion/pose\n" in told
-    by_topic: dict[str, list[tuple[Any, Any, Any]]] = {}
-    with out.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[protobuf.DecoderFactory()])
-        for schema, channel, message in reader.iter_messages():
+    found: Found = {}
+    stores: dict[int, Any] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
             assert schema is not None
-            decoded = (
-                json.loads(message.data)
-                if channel.message_encoding == "json"
-                else protobuf.DecoderFactory().decoder_for("protobuf", schema)(message.data)
-            )
-            by_topic.setdefault(channel.topic, []).append((schema.name, message.log_time, decoded))
-    kinds = {topic: (each[0][0], len(each)) for topic, each in by_topic.items()}
-    assert kinds == {
-        "/imu/imu": ("caneflow.Imu/1", 100),
-        "/radar/frame": ("foxglove.RawImage", 4),
-        "/ground_speed/speed": ("caneflow.GroundSpeed/1", 100),
-        "/fusion/pose": ("foxglove.PoseInFrame", 100),
-        "/fusion/pose/tf": ("foxglove.FrameTransform", 100),
-    }
-    _, stamp, pose = by_topic["/fusion/pose"][7]
-    assert stamp == START + 70_000_000
-    assert (pose.timestamp.seconds, pose.timestamp.nanos) == divmod(stamp, 10**9)
-    assert (pose.frame_id, pose.pose.position.x, pose.pose.position.y) == ("R0", 0.07, -2.0)
-    turned = pose.pose.orientation
-    assert (turned.w, turned.x, turned.y, turned.z) == TURN
-    _, _, transform = by_topic["/fusion/pose/tf"][7]
-    assert (transform.parent_frame_id, transform.child_frame_id, transform.translation.z) == ("R0", "fusion", 0.5)
-    _, _, image = by_topic["/radar/frame"][-1]
-    assert (image.encoding, image.width, image.height, len(image.data)) == ("mono8", 40, SCANS, 40 * SCANS)
-    assert by_topic["/imu/imu"][0][2]["gyro"] == [0.25, 0, -1]
-    assert "quality" not in by_topic["/ground_speed/speed"][0][2], "JSON has no infinity"
+            match channel.message_encoding, schema.encoding:
+                case "json", "jsonschema":
+                    decoded = json.loads(message.data)
+                case "cdr", "ros2msg":
+                    if schema.id not in stores:
+                        stores[schema.id] = get_typestore(Stores.EMPTY)
+                        stores[schema.id].register(get_types_from_msg(schema.data.decode(), schema.name))
+                    decoded = stores[schema.id].deserialize_cdr(message.data, schema.name)
+                case _:
+                    decoded = protobuf.DecoderFactory().decoder_for("protobuf", schema)(message.data)
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return found
 
 
-def test_ros_2_opens_it(caneflow: Callable[..., Run], recording: Path, tmp_path: Path) -> None:
-    highlevel = pytest.importorskip("rosbags.highlevel", reason="rosbags is not installed: caneflow[rosbag2]")
-    out = tmp_path / "bag"
-    status, told, err = caneflow("export", recording, "--format", "rosbag2", "-o", out)
+READERS = {"rosbag2": bag_of, "foxglove": foxglove_of}
+
+
+@pytest.mark.parametrize("form", READERS)
+def test_ros_messages_come_out_as_they_went_in(
+    caneflow: Callable[..., Run], recording: Path, tmp_path: Path, form: str
+) -> None:
+    status, told, err = caneflow("export", recording, "--format", form, "-o", tmp_path / "out")
     assert (status, err) == (0, "")
     assert "     100  /imu/imu/mag\n" in told
-    found: dict[str, list[tuple[int, Any]]] = {}
-    with highlevel.AnyReader([out]) as reader:
-        kinds = {connection.topic: connection.msgtype for connection in reader.connections}
-        for connection, stamp, raw in reader.messages():
-            found.setdefault(connection.topic, []).append((stamp, reader.deserialize(raw, connection.msgtype)))
-    assert kinds == {
-        "/imu/imu": "sensor_msgs/msg/Imu",
-        "/imu/imu/mag": "sensor_msgs/msg/MagneticField",
-        "/radar/frame": "sensor_msgs/msg/Image",
-        "/ground_speed/speed": "geometry_msgs/msg/TwistStamped",
-        "/fusion/pose": "geometry_msgs/msg/PoseStamped",
-    }
-    counts = {topic: len(each) for topic, each in found.items()}
-    assert counts == {
-        "/imu/imu": 100,
-        "/imu/imu/mag": 100,
-        "/radar/frame": 4,
-        "/ground_speed/speed": 90,
-        "/fusion/pose": 100,
-    }
+    found = READERS[form](tmp_path / "out")
+    kinds = {topic: (found[topic][0][1].__msgtype__, len(found[topic])) for topic in TOPICS}
+    assert kinds == TOPICS
     (stamp, imu), (_, bare) = found["/imu/imu"][:2]
     assert stamp == START
-    assert (imu.header.stamp.sec, imu.header.stamp.nanosec, imu.header.frame_id) == (START // 10**9, 0, "body")
+    assert (imu.header.stamp.sec, imu.header.stamp.nanosec, imu.header.frame_id) == (START // 10**9, 0, "imu_link")
     assert (imu.angular_velocity.z, imu.linear_acceleration.z) == (-1.0, 9.75)
     assert (imu.orientation.w, imu.orientation.y) == (0.5, -0.5)
     assert (imu.orientation_covariance[0], imu.linear_acceleration_covariance[0]) == (0, 0)
     assert (bare.orientation_covariance[0], bare.linear_acceleration_covariance[0]) == (-1, -1), "ROS for: not there"
     assert found["/imu/imu/mag"][0][1].magnetic_field.z == pytest.approx(-40e-6)
-    pose = found["/fusion/pose"][7][1]
-    assert (pose.header.frame_id, pose.pose.position.x, pose.pose.orientation.z) == ("R0", 0.07, 0.5)
+    at, odometry = found["/fusion/pose/odom"][7]
+    assert at == START + 70_000_000
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
+    assert (odometry.pose.pose.position.x, odometry.pose.pose.position.y) == (0.07, -2.0)
+    assert odometry.pose.covariance.reshape(6, 6)[1, :3].tolist() == [0, 0.02, 0]
     image = found["/radar/frame"][0][1]
     assert (image.width, image.height, image.encoding, image.data.size) == (40, SCANS, "mono8", 40 * SCANS)
+    assert (image.header.frame_id, found["/ground_speed/speed/twist"][0][1].header.frame_id) == (
+        "radar_link",
+        "base_footprint",
+    )
+
+
+def test_foxglove_has_more_than_ros(caneflow: Callable[..., Run], recording: Path, tmp_path: Path) -> None:
+    assert caneflow("export", recording, "--format", "foxglove", "-o", tmp_path / "out")[0] == 0
+    found = foxglove_of(tmp_path / "out")
+    assert set(found) - set(TOPICS) == {"/fusion/pose/foxglove", "/fusion/pose/track", "/doppler/target"}
+    stamp, odometry = found["/fusion/pose/foxglove"][7]
+    assert (odometry.timestamp.seconds, odometry.timestamp.nanos) == divmod(stamp, 10**9)
+    assert (odometry.frame_id, odometry.body_frame_id, odometry.pose.position.y) == ("odom", "imu_link", -2.0)
+    turned = odometry.pose.orientation
+    assert (turned.w, turned.x, turned.y, turned.z) == TURN
+    assert np.reshape(odometry.pose_covariance, (6, 6))[1, :3].tolist() == [0, 0.02, 0]
+    assert {pair.key: pair.value for pair in odometry.metadata} == {"method": "best"}
+    target = found["/doppler/target"][0][1]
+    assert (target["range_rate"], target["valid"]) == (0.25, True)
+
+
+def test_a_track_keeps_its_way_and_the_ellipse_of_its_end(
+    caneflow: Callable[..., Run], recording: Path, tmp_path: Path
+) -> None:
+    assert caneflow("export", recording, "--format", "foxglove", "-o", tmp_path / "out")[0] == 0
+    ((_, first),) = foxglove_of(tmp_path / "out")["/fusion/pose/track"]
+    line, ring = first.entities[0].lines
+    assert [(point.x, point.y) for point in line.points] == [(0.0, -2.0)], "once a second, so only its beginning"
+    across = [point.x for point in ring.points], [point.y for point in ring.points]
+    assert [max(each) - min(each) for each in across] == pytest.approx([4 * math.sqrt(0.01), 4 * math.sqrt(0.02)])
+
+
+@pytest.mark.parametrize("form", ["tum", "csv", *READERS])
+def test_a_post_at_2_m_ahead_and_half_a_metre_to_the_left_is_found_there(
+    caneflow: Callable[..., Run], tmp_path: Path, form: str
+) -> None:
+    """Whoever stands at x = 2 m, y = 0.5 m stands there in every form: no axis is swapped, no sign turned."""
+    post = Pose(
+        stamp=START, position=(2.0, 0.5, 0.0), velocity=(0, 0, 0), orientation=(1, 0, 0, 0), method="best",
+        covariance=np.diag([0.01, 0.04, 0.09, 1, 1, 1]),
+    )  # fmt: skip
+    path, out = tmp_path / "post.mcap", tmp_path / "out"
+    with RecordingWriter(path, flow="cane", source="live", rig={}) as writer:
+        writer.write("cane/fusion/pose", Pose, numbered(post, 0), stamp=START, seq=0, log_time=START)
+    assert caneflow("export", path, "--format", form, "-o", out)[0] == 0
+    if form == "tum":
+        assert out.read_text().split()[1:3] == ["2.0", "0.5"]
+        beside = np.loadtxt(out.with_suffix(".covariance.txt"))
+        assert (beside[0], np.diag(beside[1:].reshape(6, 6)).tolist()) == (START / 1e9, [0.01, 0.04, 0.09, 1, 1, 1])
+    elif form == "csv":
+        (row,) = csv.DictReader(out.read_text().splitlines())
+        assert (row["position_0"], row["position_1"]) == ("2.0", "0.5")
+        spread = [float(row[f"covariance_{each}_{each}"]) for each in range(6)]
+        assert (spread, row["covariance_0_1"]) == ([0.01, 0.04, 0.09, 1, 1, 1], "0.0")
+    else:
+        found = READERS[form](out)
+        ((_, tree),) = found["/tf"]
+        there = [found["/fusion/pose"][0][1].pose.position, found["/fusion/pose/odom"][0][1].pose.pose.position]
+        there.append(tree.transforms[0].transform.translation)
+        if form == "foxglove":
+            there.append(found["/fusion/pose/foxglove"][0][1].pose.position)
+            there.append(found["/fusion/pose/track"][0][1].entities[0].lines[0].points[0])
+        assert [(each.x, each.y) for each in there] == [(2.0, 0.5)] * len(there)
+
+
+def test_frames_can_be_named(caneflow: Callable[..., Run], recording: Path, tmp_path: Path) -> None:
+    options = ["--format", "rosbag2", "--world", "hall", "-o", tmp_path / "bag"]
+    assert caneflow("export", recording, *options)[0] == 0
+    assert bag_of(tmp_path / "bag")["/fusion/pose/odom"][0][1].header.frame_id == "hall"
 
 
 @pytest.mark.parametrize(
@@ -192,6 +268,7 @@ def test_ros_2_opens_it(caneflow: Callable[..., Run], recording: Path, tmp_path:
             ["rosbag2", "-o", "bag", "--stream", "imu/imu"],
             "--format rosbag2: takes the whole recording; --stream is for tum and csv",
         ),
+        (["tum", "--world", "hall"], "--format tum: has no frames; --world and --tf are for foxglove and rosbag2"),
     ],
 )
 def test_what_cannot_be_written_is_one_line(
@@ -206,7 +283,9 @@ def test_the_recording_itself_is_kept(caneflow: Callable[..., Run], recording: P
     assert (status, err) == (2, said)
 
 
-@pytest.mark.parametrize(("form", "package"), [("foxglove", "foxglove"), ("rosbag2", "rosbags.rosbag2")])
+@pytest.mark.parametrize(
+    ("form", "package", "extra"), [("foxglove", "foxglove", "foxglove"), ("rosbag2", "rosbags.rosbag2", "rosbag2")]
+)
 def test_a_library_that_is_missing_is_named(
     caneflow: Callable[..., Run],
     recording: Path,
@@ -214,11 +293,12 @@ def test_a_library_that_is_missing_is_named(
     monkeypatch: pytest.MonkeyPatch,
     form: str,
     package: str,
+    extra: str,
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     status, _, err = caneflow("export", recording, "--format", form, "-o", tmp_path / "out")
     assert status == 2
-    assert f"it comes with `pip install caneflow[{form}]`" in err
+    assert f"it comes with `pip install caneflow[{extra}]`" in err
 
 
 def test_a_bag_that_is_there_is_not_written_over(caneflow: Callable[..., Run], recording: Path, tmp_path: Path) -> None:

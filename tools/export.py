@@ -2,10 +2,13 @@
 
 import csv
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from enum import StrEnum
+from itertools import product
+from math import prod
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any, NamedTuple, TextIO, TypeAlias
 
 import msgspec
 import typer
@@ -26,6 +29,10 @@ class Format(StrEnum):
     ROSBAG2 = "rosbag2"
 
 
+COVARIANCES = ".covariance.txt"  # in place of a tum file's suffix: the file beside it
+Shape: TypeAlias = tuple[int, ...]
+FIXED: dict[tuple[type[Sample], str], Shape] = {(Pose, "covariance"): (6, 6)}  # arrays that fit into a row
+
 TEXT = (Format.TUM, Format.CSV)  # one stream, readable; the others hold the whole recording
 
 
@@ -35,11 +42,11 @@ def command(
         Format,
         typer.Option(
             "--format",
-            help="tum: a line per pose, `t x y z qx qy qz qw` in s and m, as evo reads it. "
-            "csv: a row per sample; stamp in ns, the rest in SI units and rad. "
-            "foxglove: an MCAP file for Foxglove and Rerun, with poses, transforms, numbers and pictures of the "
-            "range-Doppler map. rosbag2: a folder for ros2 bag, with sensor_msgs/Imu, geometry_msgs/PoseStamped, "
-            "TwistStamped and sensor_msgs/Image.",
+            help="tum: a line per pose, `t x y z qx qy qz qw` in s and m, as evo reads it; covariances go to a file "
+            "beside it. csv: a row per sample; stamp in ns, the rest in SI units and rad. "
+            "foxglove: an MCAP file for Foxglove, Lichtblick, PlotJuggler and Rerun. rosbag2: a folder for ros2 bag. "
+            "Both hold ROS 2 messages: Imu, MagneticField, Odometry, PoseStamped, PoseWithCovarianceStamped, "
+            "TwistWithCovarianceStamped, tf, and the range-Doppler map as Image.",
         ),
     ],
     output: Annotated[
@@ -52,6 +59,14 @@ def command(
         str | None,
         typer.Option(metavar="NODE/PORT", help="tum, csv: stream to write; by default the only one that fits."),
     ] = None,
+    world: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="foxglove, rosbag2: frame of the poses; by default odom, for a room map."),
+    ] = None,
+    tf: Annotated[
+        str | None,
+        typer.Option(metavar="NODE/PORT", help="foxglove, rosbag2: poses that fill /tf, where several could."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Write one stream of a recording as text (tum, csv), or all of it for other viewers (foxglove, rosbag2).
@@ -59,20 +74,42 @@ def command(
     Example: caneflow export track.mcap --format tum -o track.tum
     """
     if form not in TEXT:
-        _export_whole(recording, form, output, stream, overwrite=overwrite)
+        _export_whole(recording, form, output, stream, Naming(world, tf), overwrite=overwrite)
         return
+    if world is not None or tf is not None:
+        raise RecordingError(f"--format {form}: has no frames; --world and --tf are for foxglove and rosbag2")
     with whole(output, inputs=[recording], overwrite=overwrite) as path, Recording(recording) as source:
         chosen = _chosen(source, form, stream)
         samples = source.samples([(chosen.node, chosen.port)])
-        write = write_tum if form is Format.TUM else write_csv
-        if path is None:
-            write(samples, sys.stdout)
+        if form is Format.CSV:
+            with _opened(path) as text:
+                write_csv(samples, text)
         else:
-            with path.open("w", encoding="utf-8", newline="") as text:
-                write(samples, text)
+            beside = output.with_suffix(COVARIANCES) if output and path and path.name == output.name else None
+            with whole(beside, inputs=[recording], overwrite=overwrite) as covariances, _opened(path) as text:
+                write_tum(samples, text, covariances)
 
 
-def _export_whole(recording: Path, form: Format, output: Path | None, stream: str | None, *, overwrite: bool) -> None:
+@contextmanager
+def _opened(path: Path | None) -> Iterator[TextIO]:
+    """The file to write, or standard output."""
+    if path is None:
+        yield sys.stdout
+    else:
+        with path.open("w", encoding="utf-8", newline="") as text:
+            yield text
+
+
+class Naming(NamedTuple):
+    """How frames are called, and which poses move them."""
+
+    world: str | None
+    tf: str | None
+
+
+def _export_whole(
+    recording: Path, form: Format, output: Path | None, stream: str | None, naming: Naming, *, overwrite: bool
+) -> None:
     if output is None:
         raise RecordingError(
             f"--format {form}: needs -o, the {'folder' if form is Format.ROSBAG2 else 'file'} to write"
@@ -87,31 +124,44 @@ def _export_whole(recording: Path, form: Format, output: Path | None, stream: st
         if form is Format.FOXGLOVE:
             from caneflow.recording.export_foxglove import export_foxglove  # here, as each brings its own library
 
-            written = export_foxglove(source, path)
+            written = export_foxglove(source, path, world=naming.world, tf=naming.tf)
         else:
             from caneflow.recording.export_rosbag2 import export_rosbag2
 
-            written = export_rosbag2(source, path)
-        left_out = [f"{node}/{port}" for node, port in source.streams if f"/{node}/{port}" not in written]
+            written = export_rosbag2(source, path, world=naming.world, tf=naming.tf)
+        topics = {"/".join(topic.split("/")[1:3]) for topic in written}
+        left_out = [f"{node}/{port}" for node, port in source.streams if f"{node}/{port}" not in topics]
     for topic, count in written.items():
         print(f"{count:8d}  {topic}")
     if left_out:
         print(f"left out {', '.join(left_out)}: {form} has no form for it")
 
 
-def write_tum(samples: Iterable[Recorded], text: TextIO) -> None:
-    """Write poses as lines of `t x y z qx qy qz qw`: s to the ns, m, quaternion with w last."""
-    for sample in samples:
-        pose = sample.decoded()
-        assert isinstance(pose, Pose)
-        w, x, y, z = pose.orientation
-        print(f"{pose.stamp // 10**9}.{pose.stamp % 10**9:09d}", *pose.position, x, y, z, w, file=text)
+def write_tum(samples: Iterable[Recorded], text: TextIO, covariances: Path | None = None) -> None:
+    """Write poses as lines of `t x y z qx qy qz qw`: s to the ns, m, quaternion with w last.
+
+    To `covariances`, unless no pose has one: lines of t and the 36 elements for x y z vx vy vz, row by row.
+    """
+    with ExitStack() as stack:
+        beside: TextIO | None = None
+        for sample in samples:
+            pose = sample.decoded()
+            assert isinstance(pose, Pose)
+            w, x, y, z = pose.orientation
+            seconds = f"{pose.stamp // 10**9}.{pose.stamp % 10**9:09d}"
+            print(seconds, *pose.position, x, y, z, w, file=text)
+            if covariances is None or pose.covariance is None:
+                continue
+            if beside is None:
+                beside = stack.enter_context(covariances.open("w", encoding="utf-8"))
+                print("# t (s), then the covariance of x y z (m), vx vy vz (m/s), row by row", file=beside)
+            print(seconds, *pose.covariance.reshape(-1).tolist(), file=beside)
 
 
 def write_csv(samples: Iterable[Recorded], text: TextIO) -> None:
     """Write a row per sample: vectors as a column per element, absent values empty, arrays left out."""
     rows = csv.writer(text, lineterminator="\n")
-    columns: dict[str, int] | None = None
+    columns: dict[str, Shape] | None = None
     for sample in samples:
         message = sample.decoded()
         if columns is None:
@@ -121,8 +171,8 @@ def write_csv(samples: Iterable[Recorded], text: TextIO) -> None:
                     f"{sample.key}: left out {', '.join(arrays)}: an array does not fit into a row",
                     file=sys.stderr,
                 )
-            rows.writerow(name for field, n in columns.items() for name in _names(field, n))
-        rows.writerow(value for field, n in columns.items() for value in _values(getattr(message, field), n))
+            rows.writerow(name for field, shape in columns.items() for name in _names(field, shape))
+        rows.writerow(value for field, shape in columns.items() for value in _values(getattr(message, field), shape))
 
 
 def _chosen(source: Recording, form: Format, stream: str | None) -> Stream:
@@ -145,18 +195,21 @@ def _chosen(source: Recording, form: Format, stream: str | None) -> Stream:
     return fitting[0]
 
 
-def _columns(kind: type[Sample]) -> tuple[dict[str, int], list[str]]:
-    """By field how many elements its vector has (0: it is a plain value), and the fields that are arrays."""
-    columns: dict[str, int] = {}
+def _columns(kind: type[Sample]) -> tuple[dict[str, Shape], list[str]]:
+    """By field the shape of its value, (): a plain one; and the fields that are arrays of no fixed shape."""
+    columns: dict[str, Shape] = {}
     arrays: list[str] = []
     for field in msgspec.structs.fields(kind):
         match _inner(inspect.type_info(field.type)):
             case inspect.CustomType():
-                arrays.append(field.name)
+                if (shape := FIXED.get((kind, field.name))) is None:
+                    arrays.append(field.name)
+                else:
+                    columns[field.name] = shape
             case inspect.TupleType(item_types=items):
-                columns[field.name] = len(items)
+                columns[field.name] = (len(items),)
             case _:
-                columns[field.name] = 0
+                columns[field.name] = ()
     return columns, arrays
 
 
@@ -170,11 +223,13 @@ def _inner(described: inspect.Type) -> inspect.Type:
     return described
 
 
-def _names(field: str, length: int) -> list[str]:
-    return [f"{field}_{index}" for index in range(length)] or [field]
+def _names(field: str, shape: Shape) -> list[str]:
+    return ["_".join((field, *map(str, index))) for index in product(*map(range, shape))]
 
 
-def _values(value: Any, length: int) -> Sequence[Any]:
-    if length == 0:
+def _values(value: Any, shape: Shape) -> Sequence[Any]:
+    if not shape:
         return [value]
-    return [None] * length if value is None else value
+    if value is None:
+        return [None] * prod(shape)
+    return list(value) if len(shape) == 1 else value.reshape(-1).tolist()

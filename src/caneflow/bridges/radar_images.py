@@ -29,15 +29,25 @@ class RadarImages:
     """The frames of one stream into one picture per PERIOD."""
 
     def __init__(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
         self._returns = MovingReturnsFilter(MovingReturnsSettings())
         self._weights = hann(SCANS)
         self._window: SlowTimeWindow | None = None
         self._filled = 0  # scans
         self._next_ns = 0
+        self._last_ns = -1  # of the newest frame
         self._greatest = 0.0
 
     def take(self, frame: RadarFrame) -> MapImage | None:
-        """The picture up to `frame`, if one is due; raises ValueError for a frame of which none can be made."""
+        """The picture up to `frame`, if one is due; raises ValueError for a frame of which none can be made.
+
+        When time goes back, as in a viewer that jumps, the pictures begin again.
+        """
+        if frame.stamp <= self._last_ns:
+            self._begin()
+        self._last_ns = frame.stamp
         parameters = RadarParameters(
             scan_period=frame.scan_period,
             range_start=frame.range_start,
