@@ -12,9 +12,18 @@ import zenoh
 
 from caneflow.messages import GroundSpeed, Imu, Sample, numbered
 from caneflow.messages.control import Again, PortMark, Progress
-from caneflow.runtime import Emitted, Operator, node
-from caneflow.runtime.hosts.process.bus import Answered, Arrived, Asked, AskEnded, Broken, Event, Marked
-from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
+from caneflow.runtime import Emitted, Operator
+from caneflow.runtime.hosts.process import inputs, process, recovery, reports
+from caneflow.runtime.hosts.process.events import (
+    Arrived,
+    AskEnded,
+    Broken,
+    Event,
+    HistoryAnswered,
+    HistoryAsked,
+    Marked,
+)
+from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan, ProcessPlan
 
 PLAN = NodePlan(
     flow="f",
@@ -79,7 +88,7 @@ class Bus:
         self.asked: list[int] = []
         self.answers: list[list[bytes]] = []
 
-    def send(self, port: str, payload: bytes) -> None:
+    def send(self, node: str, port: str, payload: bytes) -> None:
         self.sent.append(payload)
 
     def send_progress(self, progress: Progress) -> None:
@@ -88,10 +97,10 @@ class Bus:
     def send_marks(self, progress: Progress) -> None:
         self.marked.append(progress)
 
-    def ask_again(self, port: str, first: int) -> None:
+    def ask_again(self, node: str, port: str, first: int) -> None:
         self.asked.append(first)
 
-    def answer(self, asked: Asked, payloads: list[bytes], end: Again) -> None:
+    def answer(self, asked: HistoryAsked, payloads: list[bytes], end: Again) -> None:
         self.answers.append(payloads)
 
     def pending(self) -> bool:
@@ -108,7 +117,8 @@ class Bus:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(node, "time", clock)
+    for module in (process, inputs, recovery, reports):
+        monkeypatch.setattr(module, "time", clock)
     return clock
 
 
@@ -119,7 +129,8 @@ def made(clock: Clock, tmp_path: Path) -> Callable[..., tuple[Any, Bus, Echo]]:
         outputs = {"speed": msgspec.structs.replace(PLAN.outputs["speed"], awaited=awaited)}
         plan = NodePlan(flow="f", node="echo", inputs=PLAN.inputs, outputs=outputs, replay=replay)
         echo = Echo(clock)
-        return node._OperatorNode(plan, bus, echo, tmp_path / "echo.snapshot"), bus, echo
+        host = process.Process(ProcessPlan.of(plan), bus, {"echo": echo}, tmp_path / "echo.snapshot")
+        return host, bus, echo
 
     return make
 
@@ -129,7 +140,7 @@ def arrival(seq: int, x: float = 1.0) -> Arrived:
 
 
 def sample(stamp: int, seq: int, x: float = 1.0) -> Arrived:
-    return Arrived("imu", numbered(Imu(stamp=stamp, gyro=(x, 0.0, 0.0)), seq), "caneflow.Imu/1")
+    return Arrived("echo", "imu", numbered(Imu(stamp=stamp, gyro=(x, 0.0, 0.0)), seq), "caneflow.Imu/1")
 
 
 def test_while_it_is_quick_what_follows_is_sent_before_the_bringing_thread_goes_on(made: Any) -> None:
@@ -148,14 +159,14 @@ def test_a_reader_that_waits_hears_at_once_that_nothing_follows_from_a_sample(ma
     host.take_at_once(arrival(1, x=0.0))
     (progress,) = bus.marked
     assert progress.ports["speed"] == PortMark(0, 20_000_000)
-    host.take_at_once(Marked("imu", PortMark(1, 20_000_000)))
+    host.take_at_once(Marked("echo", "imu", PortMark(1, 20_000_000)))
     assert len(bus.marked) == 1, "nothing is said twice"
     assert bus.told == [], "nobody else is woken"
 
 
 def test_a_slow_one_is_left_to_its_own_thread_for_good(made: Any) -> None:
     host, _, echo = made()
-    echo.takes = 1.01 * node.QUICK
+    echo.takes = 1.01 * process.QUICK
     taken = sum(host.take_at_once(arrival(seq)) for seq in range(2 * TIMES))
     assert 1 < taken < TIMES // 2, "some slow ones are forgiven, not many"
     echo.takes = 0.0
@@ -164,21 +175,21 @@ def test_a_slow_one_is_left_to_its_own_thread_for_good(made: Any) -> None:
 
 def test_one_that_the_machine_keeps_waiting_is_not_slow(made: Any) -> None:
     host, _, echo = made()
-    echo.waits = 0.9 * node.STALLED
+    echo.waits = 0.9 * process.STALLED
     assert all(host.take_at_once(arrival(seq)) for seq in range(10 * TIMES))
 
 
 def test_one_that_waits_for_long_is_left_to_its_own_thread(made: Any) -> None:
     host, _, echo = made()
-    echo.waits = 1.1 * node.STALLED
+    echo.waits = 1.1 * process.STALLED
     assert sum(host.take_at_once(arrival(seq)) for seq in range(2 * TIMES)) < TIMES // 2
 
 
 def test_no_sample_waits_for_the_disk_that_a_snapshot_goes_to(made: Any, clock: Clock) -> None:
     host, bus, _ = made()
     host.take_at_once(arrival(0))
-    clock.now += 1.01 * node.LIVE_SNAPSHOT_PERIOD
-    keep, taken = host.keeper.keep, []
+    clock.now += 1.01 * recovery.LIVE_SNAPSHOT_PERIOD
+    keep, taken = host.recovery["echo"].keeper.keep, []
 
     def bring() -> None:
         taken.append(host.take_at_once(arrival(1)))
@@ -189,17 +200,17 @@ def test_no_sample_waits_for_the_disk_that_a_snapshot_goes_to(made: Any, clock: 
         bringing.join(30)
         return bool(keep(snapshot))
 
-    host.keeper.keep = keep_slowly
-    host.keep_snapshot()
+    host.recovery["echo"].keeper.keep = keep_slowly
+    host.keep_snapshots()
     assert taken == [True]
     assert len(bus.sent) == 2
-    assert host.confirmed == {"f/imu/imu": 0}, "the sample that came meanwhile is not in it"
+    assert host.recovery["echo"].confirmed == {"f/imu/imu": 0}, "the sample that came meanwhile is not in it"
 
 
 def test_one_slow_event_in_five_is_forgiven(made: Any) -> None:
     host, _, echo = made()
     for seq in range(10 * TIMES):
-        echo.takes = 10 * node.QUICK if seq % 5 == 0 else 0.0
+        echo.takes = 10 * process.QUICK if seq % 5 == 0 else 0.0
         assert host.take_at_once(arrival(seq))
 
 
@@ -215,19 +226,19 @@ def test_what_an_operator_raises_is_raised_on_the_nodes_own_thread(made: Any) ->
 
 def test_in_a_replay_however_slow_it_is_samples_are_taken_at_once_and_nothing_else(made: Any) -> None:
     host, bus, echo = made(replay=True)
-    echo.takes = 10 * node.QUICK
+    echo.takes = 10 * process.QUICK
     for seq in range(2 * TIMES):
         assert host.take_at_once(arrival(seq))
     assert len(bus.sent) == 2 * TIMES
-    assert not host.take_at_once(Marked("imu", PortMark(2 * TIMES, 10**12)))
+    assert not host.take_at_once(Marked("echo", "imu", PortMark(2 * TIMES, 10**12)))
 
 
 def test_between_the_samples_of_a_replay_all_else_is_done(made: Any) -> None:
     """Samples may come without end: who asks is answered all the same, and how far the node has come is said."""
     host, bus, echo = made(replay=True)
-    echo.takes = node.REPORT_PERIOD
+    echo.takes = reports.REPORT_PERIOD
     host.take_at_once(arrival(0))
-    bus.inbox.append(Asked("speed", 0, query=cast("zenoh.Query", None)))
+    bus.inbox.append(HistoryAsked("echo", "speed", 0, query=cast("zenoh.Query", None)))
     host.take_at_once(arrival(1))
     assert [len(each) for each in bus.answers] == [0], "nobody reads it, so nothing is kept for anybody"
     assert [progress.handled for progress in bus.told] == [10_000_000, 20_000_000]
@@ -235,17 +246,17 @@ def test_between_the_samples_of_a_replay_all_else_is_done(made: Any) -> None:
 
 def test_in_a_replay_what_does_not_come_is_asked_for_and_waited_for(made: Any, clock: Clock) -> None:
     host, bus, _ = made(replay=True)
-    host.take(Answered("imu", 0, PortMark(-1, -1)))
+    host.take(HistoryAnswered("echo", "imu", 0, PortMark(-1, -1)))
     host.take_at_once(arrival(0))
-    host.take(Marked("imu", PortMark(2, 10**12)))
+    host.take(Marked("echo", "imu", PortMark(2, 10**12)))
     host.ask_for_missing()
     assert bus.asked == [1]
-    clock.now += 0.9 * node.REPLAY_PATIENCE
+    clock.now += 0.9 * inputs.REPLAY_PATIENCE
     host.ask_for_missing()
-    assert host.stage.inputs["imu"].counts.lost == 0
-    clock.now += 0.11 * node.REPLAY_PATIENCE
+    assert host.stages["echo"].inputs["imu"].counts.lost == 0
+    clock.now += 0.11 * inputs.REPLAY_PATIENCE
     host.ask_for_missing()
-    assert host.stage.inputs["imu"].counts.lost == 2
+    assert host.stages["echo"].inputs["imu"].counts.lost == 2
 
 
 def test_what_is_asked_for_already_is_not_asked_for_twice(made: Any, clock: Clock) -> None:
@@ -253,10 +264,10 @@ def test_what_is_asked_for_already_is_not_asked_for_twice(made: Any, clock: Cloc
     host.ask_for_missing()
     host.take_at_once(arrival(7))
     assert bus.asked == [0], "a node that is new asks for what it may have missed: that is the same"
-    clock.now += 1.01 * node.ASK_PERIOD
+    clock.now += 1.01 * inputs.ASK_PERIOD
     host.ask_for_missing()
     assert bus.asked == [0], "the answer may be on its way, or wait behind what came before it"
-    host.take(AskEnded("imu"))
+    host.take(AskEnded("echo", "imu"))
     host.ask_for_missing()
     assert set(bus.asked) == {0}, "there was no answer"
     assert len(bus.asked) > 1
@@ -264,7 +275,7 @@ def test_what_is_asked_for_already_is_not_asked_for_twice(made: Any, clock: Cloc
 
 def test_a_gap_in_the_numbers_is_asked_for_at_once(made: Any) -> None:
     host, bus, _ = made(replay=True)
-    host.take(Answered("imu", 0, PortMark(-1, -1)))
+    host.take(HistoryAnswered("echo", "imu", 0, PortMark(-1, -1)))
     host.take_at_once(arrival(0))
     host.take_at_once(arrival(2))
     assert bus.asked == [1]
@@ -274,16 +285,16 @@ def test_live_a_writer_that_is_silent_is_waited_for_longer_than_one_that_goes_on
     """A busy one answers when it is done; one that sends more and does not answer will not."""
     for goes_on in (False, True):
         host, _, _ = made()
-        counts = host.stage.inputs["imu"].counts
+        counts = host.stages["echo"].inputs["imu"].counts
         host.take_at_once(arrival(0))
         host.take_at_once(arrival(2))
-        clock.now += 0.5 * node.LIVE_PATIENCE
+        clock.now += 0.5 * inputs.LIVE_PATIENCE
         if goes_on:
             host.take_at_once(arrival(3))
-        clock.now += 0.6 * node.LIVE_PATIENCE
+        clock.now += 0.6 * inputs.LIVE_PATIENCE
         host.ask_for_missing()
         assert counts.lost == (1 if goes_on else 0)
-        clock.now += node.SILENT_PATIENCE
+        clock.now += inputs.SILENT_PATIENCE
         host.ask_for_missing()
         assert counts.lost == 1
         host.handle_what_is_due()
@@ -298,14 +309,14 @@ def test_what_lies_in_the_future_moves_nothing(made: Any, stamp: int | None) -> 
     late = 2**63 - 2 if stamp is None else now + stamp * 10**9
     host.take_at_once(sample(now, 0))
     host.take_at_once(sample(late, 1))
-    host.take_at_once(Marked("imu", PortMark(1, late)))
-    host.take_at_once(Answered("imu", 0, PortMark(1, late)))
+    host.take_at_once(Marked("echo", "imu", PortMark(1, late)))
+    host.take_at_once(HistoryAnswered("echo", "imu", 0, PortMark(1, late)))
     host.take_at_once(sample(now + 1, 2))
     assert len(bus.sent) == 2
-    assert host.stage.progress().handled == now + 1
+    assert host.stages["echo"].progress().handled == now + 1
     assert bus.asked == [], "the one that was refused is not missing"
-    host.take_at_once(Marked("imu", PortMark(2, 2**63 - 1)))
-    assert host.stage.finished
+    host.take_at_once(Marked("echo", "imu", PortMark(2, 2**63 - 1)))
+    assert host.stages["echo"].finished
 
 
 def test_a_replay_has_no_present(made: Any) -> None:

@@ -10,8 +10,10 @@ import zenoh
 from caneflow.messages import control_key, encode
 from caneflow.messages.control import Again, PortMark, Progress
 from caneflow.runtime.hosts.links.session import Ports, open_session
-from caneflow.runtime.hosts.process.bus import AGAIN, Arrived, Asked, Bus, Event, Started
-from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan
+from caneflow.runtime.hosts.process.bus import Bus
+from caneflow.runtime.hosts.process.callbacks import AGAIN
+from caneflow.runtime.hosts.process.events import Arrived, Event, HistoryAsked, Started
+from caneflow.runtime.plan import InputPlan, Links, NodePlan, OutputPlan, ProcessPlan
 from tests.flows import wait_for
 
 KEY = "f/imu/imu"
@@ -25,7 +27,7 @@ def met(*, replay: bool) -> Iterator[tuple[Bus, zenoh.Session]]:
     endpoint = ports.endpoint()
     inputs = {"imu": InputPlan(key=KEY, schema="caneflow.Imu/1", writer="imu")}
     plan = NodePlan(flow="f", node="sink", replay=replay, inputs=inputs, links=Links(listen=(endpoint,)))
-    with Bus(plan) as bus, open_session(connect=[endpoint], replay=replay) as writer:
+    with Bus(ProcessPlan.of(plan)) as bus, open_session(connect=[endpoint], replay=replay) as writer:
         yield bus, writer
     ports.release()
 
@@ -88,13 +90,13 @@ def test_in_a_replay_no_mark_or_answer_overtakes_the_samples_that_were_sent_befo
         say(writer, 2)
         mark = encode(Progress("imu", 20, {"imu": PortMark(1, 20)}))
         writer.put(progress, mark, congestion_control=zenoh.CongestionControl.BLOCK)
-        bus.ask_again("imu", 0)
+        bus.ask_again("sink", "imu", 0)
         assert answered.wait(30)
         say(writer, 1)
         assert came == []
         free.set()
         wait_for(lambda: len(came) == 7, "everything to be taken")
-    assert came == ["Arrived", "Arrived", "Marked", "ArrivedAgain", "Answered", "AskEnded", "Arrived"]
+    assert came == ["Arrived", "Arrived", "Marked", "ArrivedAgain", "HistoryAnswered", "AskEnded", "Arrived"]
 
 
 @pytest.mark.parametrize("replay", [False, True])
@@ -122,14 +124,14 @@ def test_a_request_that_names_no_number_is_left_unanswered(asked: bytes, caplog:
     endpoint = ports.endpoint()
     outputs = {"imu": OutputPlan(key=KEY, schema="caneflow.Imu/1")}
     plan = NodePlan(flow="f", node="imu", outputs=outputs, links=Links(listen=(endpoint,)))
-    with Bus(plan) as bus, open_session(connect=[endpoint]) as reader:
+    with Bus(ProcessPlan.of(plan)) as bus, open_session(connect=[endpoint]) as reader:
         key = control_key("f", "history", "imu", "imu")
         querier = reader.declare_querier(key, timeout=30.0)
         wait_for(lambda: querier.matching_status.matching, "the link")  # type: ignore[attr-defined]  # the stub says bool
         assert list(querier.get(payload=asked)) == []
         replies = querier.get(payload=b"7")
         (event,) = bus.events(30)
-        assert isinstance(event, Asked)
+        assert isinstance(event, HistoryAsked)
         assert event.first == 7
         bus.answer(event, [], Again(0, PortMark(-1, -1)))
         assert len(list(replies)) == 1

@@ -16,13 +16,14 @@ import zenoh
 from caneflow.messages import Imu, decode
 from caneflow.messages.control import Again, PortMark
 from caneflow.recording import Recording
-from caneflow.runtime import Brought, Quiet, Source, node
-from caneflow.runtime.hosts.process.bus import Asked, Confirmed, Event, Started
-from caneflow.runtime.plan import NodePlan, OutputPlan
+from caneflow.runtime import Brought, Quiet, Source
+from caneflow.runtime.hosts.process.events import Confirmed, Event, HistoryAsked, Started
+from caneflow.runtime.hosts.process.sources import SourceProcess
+from caneflow.runtime.plan import NodePlan, OutputPlan, ProcessPlan
 from tests.flows import CANEFLOW, launchers, node_processes, wait_for
 
 OUTPUT = OutputPlan(key="f/imu/imu", schema="caneflow.Imu/1", readers=("reader",))
-PLAN = NodePlan(flow="f", node="imu", outputs={"imu": OUTPUT})
+PLAN = ProcessPlan.of(NodePlan(flow="f", node="imu", outputs={"imu": OUTPUT}))
 PATIENCE = 30.0  # s that a test waits for another thread
 
 
@@ -38,10 +39,10 @@ class Bus:
     def events(self, timeout: float | None) -> Iterator[Event]:
         yield self.inbox.get(timeout=timeout)
 
-    def answer(self, asked: Asked, payloads: list[bytes], end: Again) -> None:
+    def answer(self, asked: HistoryAsked, payloads: list[bytes], end: Again) -> None:
         self.answers.put(([decode(each, Imu).seq for each in payloads], end))
 
-    def send(self, port: str, payload: bytes) -> None:
+    def send(self, node: str, port: str, payload: bytes) -> None:
         self.sent.append(payload)
 
     def declare_ready(self) -> None:
@@ -62,7 +63,7 @@ class Device(Source):
         self.answers: list[tuple[list[int], Again]] = []
 
     def ask(self, first: int) -> None:
-        self.bus.put(Asked("imu", first, query=cast("zenoh.Query", None)))
+        self.bus.put(HistoryAsked("imu", "imu", first, query=cast("zenoh.Query", None)))
         self.answers.append(self.bus.answers.get(timeout=PATIENCE))
 
     def samples(self) -> Brought:
@@ -71,7 +72,7 @@ class Device(Source):
         if self.says_quiet:
             yield Quiet(until=40)
         self.ask(1)
-        self.bus.put(Confirmed("imu", "reader", 1))
+        self.bus.put(Confirmed("imu", "imu", "reader", 1))
         self.ask(0)
         os.kill(os.getpid(), signal.SIGTERM)
         threading.Event().wait(PATIENCE)  # blocked in its read
@@ -82,7 +83,7 @@ class Device(Source):
 def test_what_is_asked_while_it_reads_its_device_is_answered(says_quiet: bool) -> None:
     bus: Any = Bus()
     device = Device(bus, says_quiet=says_quiet)
-    node._SourceNode(PLAN, bus, device).run()
+    SourceProcess(PLAN, bus, device).run()
     mark = PortMark(2, 40 if says_quiet else 30)
     assert device.answers == [([1, 2], Again(0, mark)), ([2], Again(2, mark))]
 
@@ -97,12 +98,12 @@ def test_an_error_while_it_answers_ends_it_out_of_its_read() -> None:
     bus.answer = fail
 
     def ask(first: int) -> None:
-        bus.put(Asked("imu", first, query=cast("zenoh.Query", None)))
+        bus.put(HistoryAsked("imu", "imu", first, query=cast("zenoh.Query", None)))
         threading.Event().wait(PATIENCE)
 
     device.ask = ask  # type: ignore[method-assign]  # nobody answers
     with pytest.raises(ZeroDivisionError, match="a bug of ours"):
-        node._SourceNode(PLAN, bus, device).run()
+        SourceProcess(PLAN, bus, device).run()
 
 
 UNPLUGGED = """

@@ -12,9 +12,10 @@ import msgspec
 import pytest
 
 from caneflow.messages import GroundSpeed, Imu, Sample, numbered
-from caneflow.runtime import Context, Emitted, Operator, node
-from caneflow.runtime.hosts.process.bus import Arrived, Event
-from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
+from caneflow.runtime import Context, Emitted, Operator
+from caneflow.runtime.hosts.process.events import Arrived, Event
+from caneflow.runtime.hosts.process.process import Process
+from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan, ProcessPlan
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.snapshot_keeper import LAYOUT, Snapshot, SnapshotKeeper
 
@@ -53,7 +54,7 @@ class Bus:
     def __init__(self) -> None:
         self.sent: list[bytes] = []
 
-    def send(self, port: str, payload: bytes) -> None:
+    def send(self, node: str, port: str, payload: bytes) -> None:
         self.sent.append(payload)
 
     def send_progress(self, progress: object) -> None: ...
@@ -62,7 +63,7 @@ class Bus:
 
     def send_counters(self, counters: object) -> None: ...
 
-    def ask_again(self, port: str, first: int) -> None: ...
+    def ask_again(self, node: str, port: str, first: int) -> None: ...
 
     def pending(self) -> bool:
         return False
@@ -91,7 +92,7 @@ def make(folder: Path) -> Make:
     def make(operator: Operator | None = None, *, replay: bool = False, folder: Path = folder) -> Any:
         plan = NodePlan(flow="f", node="adder", inputs={"imu": INPUT}, outputs={"speed": OUTPUT}, replay=replay)
         bus: Any = Bus()
-        return node._OperatorNode(plan, bus, operator or Adder(), folder / "adder.snapshot")
+        return Process(ProcessPlan.of(plan), bus, {"adder": operator or Adder()}, folder / "adder.snapshot")
 
     return make
 
@@ -100,9 +101,9 @@ def take(host: Any, *seqs: int) -> None:
     """Let the node handle samples, and keep a snapshot of what it has come to."""
     for seq in seqs:
         sample = Imu(stamp=10 * (seq + 1), gyro=(float(seq), 0.0, 0.0))
-        host.take_sample_at_once(Arrived("imu", numbered(sample, seq), "caneflow.Imu/1"))
-    host._next_snapshot = 0.0
-    host.keep_snapshot()
+        host.take_sample_at_once(Arrived("adder", "imu", numbered(sample, seq), "caneflow.Imu/1"))
+    host.recovery["adder"]._next = 0.0
+    host.keep_snapshots()
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -115,19 +116,19 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
 def test_a_new_process_goes_on_where_the_last_snapshot_was_taken(make: Make) -> None:
     host = make()
     take(host, 0, 1, 2)
-    assert host.confirmed == {"f/imu/imu": 2}
+    assert host.recovery["adder"].confirmed == {"f/imu/imu": 2}
     again = make()
-    assert again.resume()
-    assert again.stage.state() == host.stage.state()
-    assert again.history.kept() == host.history.kept()
-    assert again.confirmed == {"f/imu/imu": 2}
+    assert again.recovery["adder"].resume()
+    assert again.stages["adder"].state() == host.stages["adder"].state()
+    assert again.outputs["adder"].history.kept() == host.outputs["adder"].history.kept()
+    assert again.recovery["adder"].confirmed == {"f/imu/imu": 2}
     take(again, 3)
-    assert make().resume(), "its own snapshots hold the operator that came back"
-    assert vars(again.stage._operator) == {"total": 6.0, "seen": [0, 1, 2, 3]}
+    assert make().recovery["adder"].resume(), "its own snapshots hold the operator that came back"
+    assert vars(again.stages["adder"]._operator) == {"total": 6.0, "seen": [0, 1, 2, 3]}
 
 
 def test_without_a_snapshot_there_is_nothing_to_say(make: Make, caplog: pytest.LogCaptureFixture) -> None:
-    assert not make().resume()
+    assert not make().recovery["adder"].resume()
     assert warnings(caplog) == []
 
 
@@ -203,16 +204,16 @@ def test_a_snapshot_that_does_not_fit_is_one_line_and_a_start_without(
     file = folder / "adder.snapshot"
     file.write_bytes(change(file.read_bytes()))
     host = make()
-    fresh = host.stage.state()
-    assert not host.resume()
+    fresh = host.stages["adder"].state()
+    assert not host.recovery["adder"].resume()
     (said,) = warnings(caplog)
     assert said.startswith("starts without its snapshot, which cannot be used: ")
     assert says in said
-    assert host.stage.state() == fresh
-    assert vars(host.stage._operator) == {"total": 0.0, "seen": []}
+    assert host.stages["adder"].state() == fresh
+    assert vars(host.stages["adder"]._operator) == {"total": 0.0, "seen": []}
     take(host, 0)
-    assert vars(host.stage._operator) == {"total": 0.0, "seen": [0]}
-    assert make().resume(), "the next one is its own"
+    assert vars(host.stages["adder"]._operator) == {"total": 0.0, "seen": [0]}
+    assert make().recovery["adder"].resume(), "the next one is its own"
 
 
 def test_what_is_no_file_is_no_snapshot(make: Make, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -220,14 +221,14 @@ def test_what_is_no_file_is_no_snapshot(make: Make, folder: Path, caplog: pytest
     take(make(), 0)
     (folder / "adder.snapshot").rename(elsewhere)
     (folder / "adder.snapshot").symlink_to(elsewhere)
-    assert not make().resume()
+    assert not make().recovery["adder"].resume()
     (folder / "adder.snapshot").unlink()
     os.mkfifo(folder / "adder.snapshot")
-    assert not make().resume(), "nobody waits for somebody to write"
+    assert not make().recovery["adder"].resume(), "nobody waits for somebody to write"
     (folder / "adder.snapshot").unlink()
     (folder / "adder.snapshot").mkdir()
     host = make()
-    assert not host.resume()
+    assert not host.recovery["adder"].resume()
     assert len(warnings(caplog)) == 3
     take(host, 0)
     assert "cannot write a snapshot" in warnings(caplog)[0]
@@ -239,7 +240,7 @@ def test_a_folder_that_others_write_to_is_not_used(make: Make, folder: Path, cap
     link.symlink_to(folder)
     folder.chmod(0o770)
     for place in (folder, link, folder.parent / "gone"):
-        assert not make(folder=place).resume()
+        assert not make(folder=place).recovery["adder"].resume()
         (said,) = warnings(caplog)
         assert said.startswith(f"keeps no snapshots: {place}: ")
 
@@ -260,12 +261,14 @@ def test_on_a_full_disk_the_operator_goes_on_and_confirms_nothing_that_is_not_ke
         take(host, 3)
     (said,) = warnings(caplog)
     assert said.startswith("cannot write a snapshot: No space left on device; goes on without")
-    assert host.confirmed == {"f/imu/imu": 1}, "a new process goes on from the snapshot before and asks for the rest"
+    assert host.recovery["adder"].confirmed == {"f/imu/imu": 1}, (
+        "a new process goes on from the snapshot before and asks for the rest"
+    )
     again = make(replay=replay)
-    assert again.resume()
-    assert again.stage.inputs["imu"].expected == 2
+    assert again.recovery["adder"].resume()
+    assert again.stages["adder"].inputs["imu"].expected == 2
     take(host, 4)
-    assert host.confirmed == {"f/imu/imu": 4}, "there is room again"
+    assert host.recovery["adder"].confirmed == {"f/imu/imu": 4}, "there is room again"
     assert os.listdir(folder) == ["adder.snapshot"]  # noqa: PTH208 - names alone
 
 
@@ -290,7 +293,7 @@ def test_a_removed_folder_is_not_made_again_nor_found_under_its_name(
     take(host, 2)
     assert not list(folder.iterdir())
     assert len(warnings(caplog)) == 1
-    assert host.confirmed == {"f/imu/imu": 0}
+    assert host.recovery["adder"].confirmed == {"f/imu/imu": 0}
 
 
 def test_live_an_operator_that_cannot_be_kept_begins_after_a_kill_with_what_is_new(
@@ -301,22 +304,22 @@ def test_live_an_operator_that_cannot_be_kept_begins_after_a_kill_with_what_is_n
     take(host, 2)
     (said,) = warnings(caplog)
     assert said.startswith("cannot be brought back exactly after a kill: state.lines is a ")
-    assert host.confirmed == {"f/imu/imu": 2}
+    assert host.recovery["adder"].confirmed == {"f/imu/imu": 2}
     assert not list(folder.iterdir())
 
 
 def test_in_a_replay_it_begins_again_with_its_first_sample(make: Make) -> None:
     host = make(Unkeepable(), replay=True)
     take(host, 0, 1)
-    assert host.confirmed == {}
+    assert host.recovery["adder"].confirmed == {}
 
 
 def test_live_an_old_snapshot_is_not_gone_on_from_once_none_can_be_taken(make: Make, folder: Path) -> None:
     host = make()
     take(host, 0)
-    host.stage._operator.seen = iter(())
+    host.stages["adder"]._operator.seen = iter(())
     take(host)
-    host.stage.inputs["imu"].handled_seq = 1
+    host.stages["adder"].inputs["imu"].handled_seq = 1
     take(host)
     assert not list(folder.iterdir())
 
@@ -325,8 +328,8 @@ def test_an_attribute_that_is_deleted_is_named_not_taken_for_damage_later(
     make: Make, caplog: pytest.LogCaptureFixture
 ) -> None:
     host = make()
-    del host.stage._operator.total
-    host.stage.inputs["imu"].handled_seq = 1
+    del host.stages["adder"]._operator.total
+    host.stages["adder"].inputs["imu"].handled_seq = 1
     take(host)
     assert warnings(caplog) == [
         "cannot be brought back exactly after a kill: state.total was deleted; a snapshot without it would look damaged"
@@ -343,9 +346,9 @@ def test_a_snapshot_that_an_error_follows_is_not_gone_on_from_again(
     if kept_since:
         handle_all = host.handle_all
 
-        def keep_one_and_go_on(*, resumed: bool) -> None:
+        def keep_one_and_go_on(resumed: list[str]) -> None:
             take(host, 1)
-            handle_all(resumed=resumed)
+            handle_all(resumed)
 
         host.handle_all = keep_one_and_go_on
     with pytest.raises(ZeroDivisionError):
@@ -358,14 +361,14 @@ def test_a_node_that_started_without_keeps_its_snapshots_when_it_fails(make: Mak
     host = make()
     take(host, 0)
     with pytest.raises(ZeroDivisionError):
-        host.handle_all(resumed=False)
-    host.keeper.note_failure()
+        host.handle_all([])
+    host.recovery["adder"].keeper.note_failure()
     assert (folder / "adder.snapshot").exists()
 
 
 def test_a_state_of_other_ports_changes_nothing(make: Make) -> None:
     host = make()
-    state = msgspec.structs.replace(host.stage.state(), inputs={"speed": (3, 4)})
+    state = msgspec.structs.replace(host.stages["adder"].state(), inputs={"speed": (3, 4)})
     with pytest.raises(SnapshotError, match="has the inputs speed; expected imu"):
-        host.stage.resume(state, Adder())
-    assert host.stage.inputs["imu"].expected == 0
+        host.stages["adder"].resume(state, Adder())
+    assert host.stages["adder"].inputs["imu"].expected == 0

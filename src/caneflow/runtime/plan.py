@@ -104,3 +104,49 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
             return msgspec.json.decode(path.read_bytes(), type=cls)
         except (OSError, msgspec.DecodeError) as error:
             raise DataflowError(f"{path}: {error}; a node is started by `caneflow run`") from error
+
+
+class ProcessPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
+    """One process of a run: the nodes that share it, their links being the same ones."""
+
+    name: str
+    nodes: tuple[NodePlan, ...]  # at least one
+
+    @classmethod
+    def of(cls, plan: NodePlan) -> "ProcessPlan":
+        """The process of a node that has one for itself."""
+        return cls(name=plan.node, nodes=(plan,))
+
+    @cached_property
+    def members(self) -> dict[str, NodePlan]:
+        """The plans of its nodes by name."""
+        return {plan.node: plan for plan in self.nodes}
+
+    @property
+    def flow(self) -> str:
+        """The name of the flow."""
+        return self.nodes[0].flow
+
+    @property
+    def replay(self) -> bool:
+        """Whether the sources of the flow are recordings."""
+        return self.nodes[0].replay
+
+    @property
+    def links(self) -> Links:
+        """Where the process listens and whom it dials."""
+        return self.nodes[0].links
+
+    @cached_property
+    def arriving(self) -> dict[tuple[str, str], InputPlan]:
+        """By node and port the inputs whose writers are in other processes."""
+        return {
+            (plan.node, port): wire
+            for plan in self.nodes
+            for port, wire in plan.inputs.items()
+            if wire.writer not in self.members
+        }
+
+    def readers_outside(self, out: OutputPlan) -> tuple[str, ...]:
+        """The nodes in other processes that read an output."""
+        return tuple(reader for reader in out.readers if reader not in self.members)

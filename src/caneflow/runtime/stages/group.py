@@ -37,6 +37,7 @@ class Group:
             for port, wire in plans[name].inputs.items():
                 if wire.writer in plans:
                     self._wires.setdefault((wire.writer, wire.key.rpartition("/")[2]), []).append((name, port))
+        self._heard = {name for (name, _), readers in self._wires.items() if readers}  # by other members
         self._steps: list[tuple[str, Reader]] = []
         self._next = 0  # of those: where `step` goes on
 
@@ -65,7 +66,7 @@ class Group:
                 message = decode(payload, feed.outputs[port].plan.kind)
             except MessageError as error:
                 for reader, at in readers:
-                    self.readers[reader].refuse(at, error)
+                    self.refuse(reader, at, error)
             else:
                 self._spread(node, port, message, payload)
         return payload
@@ -89,6 +90,31 @@ class Group:
             self._spread_all(node, emitted)
         return emitted
 
+    def refuse(self, node: str, port: str, error: MessageError) -> None:
+        """Count a sample to a member that could not be decoded."""
+        self._next = 0
+        self.readers[node].refuse(port, error)
+
+    def refuse_ahead(
+        self, node: str, port: str, message: Sample, ahead: int, time: int, *, again: bool = False
+    ) -> None:
+        """Refuse a live sample that is stamped `ahead` ns in the future."""
+        self._next = 0
+        reader = self.readers[node]
+        if isinstance(reader, Stage):
+            reader.refuse_ahead(port, message, ahead, again=again)
+        else:
+            reader.refuse_ahead(port, message, ahead, time, again=again)
+
+    def skip_to(self, node: str, port: str, seq: int, time: int) -> None:
+        """Stop waiting for samples before `seq` that were sent to a member's port and did not arrive."""
+        self._next = 0
+        reader = self.readers[node]
+        if isinstance(reader, Stage):
+            reader.skip_to(port, seq)
+        else:
+            reader.skip_to(port, seq, time)
+
     def mark(self, node: str, port: str, mark: PortMark) -> None:
         """Take a writer's word on how far the stream to a member's port has come."""
         self._next = 0
@@ -101,7 +127,8 @@ class Group:
         """
         if self._next == 0:
             for name, feed in self.feeds.items():
-                self._pass_marks(name, feed)
+                if name in self._heard:
+                    self._pass_marks(name, feed)
         while self._next < len(self._steps):
             name, reader = self._steps[self._next]
             if isinstance(reader, Tap):
@@ -111,7 +138,8 @@ class Group:
                 if (emitted := reader.step(now)) is not None:
                     self._spread_all(name, emitted)
                     return name, emitted
-                self._pass_marks(name, reader)
+                if name in self._heard:
+                    self._pass_marks(name, reader)
             self._next += 1
         self._next = 0
         return None
