@@ -24,6 +24,7 @@ from caneflow.messages import (
     Imu,
     Pose,
     RadarFrame,
+    Ranges,
     Sample,
     bounds,
     decode,
@@ -44,6 +45,7 @@ from operators.doppler import Doppler
 from operators.fusion import Fusion
 from operators.ground_speed import GroundSpeedOperator
 from operators.room_tracker import RoomTrackerOperator
+from operators.surroundings import Surroundings
 
 RIG = read_rig(
     {
@@ -57,6 +59,18 @@ RIG = read_rig(
         "sensors": {
             "south": {"position": [4, -1, 1.2], "azimuth": 1.57, "k": 1.7},
             "west": {"position": [-1, 4, 1.2], "azimuth": 0.0},
+        },
+        "rangers": {
+            name: {
+                "position": [0, -0.2, 0.03],
+                "boresight": [0.8, 0, tilt],
+                "up": [-tilt, 0, 0.8],
+                "rows": 3,
+                "columns": 4,
+                "field": [0.8, 0.8],
+                "reach": [0.02, 4],
+            }
+            for name, tilt in (("upper", 0.6), ("lower", -0.6))
         },
     }
 )
@@ -215,6 +229,19 @@ class World:
             delay=self.maybe(lambda: self.number(0.128, 0.0, bounds.DELAY)),
         )
 
+    def ranges(self, stamp: int) -> Ranges:
+        zones = self.dice.choice((1, 12)) if self.is_wild(0.2) else 12
+        ranges = np.abs(self.array((zones,), "f", 1.0, bounds.RANGE))
+        status = self.arrays.integers(0, 5, zones) if self.is_wild() else np.zeros(zones)
+        return Ranges(
+            stamp=stamp,
+            ranges=ranges,
+            status=status.astype(np.uint8),
+            sigma=self.maybe(lambda: np.abs(self.array((zones,), "f", 0.02, bounds.RANGE))),
+            exposure=self.maybe(lambda: self.number(0.066, 0.0, bounds.DELAY)),
+            delay=self.maybe(lambda: self.number(0.005, 0.0, bounds.DELAY)),
+        )
+
     def messages(self, ports: Mapping[str, type[Sample]], count: int) -> Iterator[tuple[str, Sample]]:
         """So many, each on any port, each later than the one before."""
         make: dict[type[Sample], Callable[[int], Sample]] = {
@@ -224,6 +251,7 @@ class World:
             Pose: self.pose,
             DopplerBlock: self.block,
             DopplerTarget: self.target,
+            Ranges: self.ranges,
         }
         seqs = dict.fromkeys(ports, 0)
         stamp = self.dice.choice(STARTS)
@@ -281,6 +309,7 @@ CASES = {
         )
         for method in ("particle", "heading_particle", "ekf", "best")
     },
+    "surroundings": Case(Surroundings, {"pose": Pose, "imu": Imu, "upper": Ranges, "lower": Ranges}, most=300),
     "room_tracker best cane": Case(RoomTrackerOperator, {**ROOM, "cane": Pose}),
 }
 
