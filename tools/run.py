@@ -21,10 +21,11 @@ from caneflow.runtime.dataflow.loading import load, read_rig
 from caneflow.runtime.deployment import Deployment, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
+from caneflow.runtime.hosts.launcher.console import Console
 from caneflow.runtime.hosts.launcher.fork_server import ForkServer
 from caneflow.runtime.hosts.launcher.launcher import Launcher
 from caneflow.runtime.hosts.launcher.open_files import raise_limit, require_open_files
-from caneflow.runtime.outcome import Outcome
+from caneflow.runtime.outcome import Outcome, troubles
 from caneflow.runtime.replayed import Replay
 from caneflow.runtime.wording import listed
 
@@ -133,7 +134,9 @@ def command(
             outcome = InProcess(deployment, programs).run_until_interrupted()
         else:
             restarts = {name: node.restart for name, node in graph.nodes.items()}
-            outcome = Launcher(deployment, restarts, report, fork_server, keys or file.parent / "keys").run()
+            with Console() as console:
+                launcher = Launcher(deployment, restarts, console, fork_server, keys or file.parent / "keys")
+                outcome = launcher.run()
         summary(deployment, outcome, time.monotonic() - started)
         raise typer.Exit(outcome.status)
 
@@ -150,16 +153,6 @@ def _kept(
     return reserved(record, inputs=inputs, overwrite=overwrite)
 
 
-def report(node: str, line: str) -> None:
-    """Print a node's line under its name."""
-    print(f"{node} | {_visible(line)}", file=sys.stderr, flush=True)
-
-
-def _visible(line: str) -> str:
-    """A line of a node's as the terminal can show it; its indentation stays."""
-    return printable(line.expandtabs())
-
-
 def summary(deployment: Deployment, outcome: Outcome, took_s: float) -> None:
     """Print how the run ended: what each node gave, what was refused or lost, what failed."""
     for node, counters in outcome.counters.items():
@@ -173,15 +166,7 @@ def summary(deployment: Deployment, outcome: Outcome, took_s: float) -> None:
 
 def _counted(counters: Counters) -> str:
     given = [f"{sent} x {port}" for port, sent in counters.outputs.items()]
-    troubles = [
-        f"{port}: {number} {what}"
-        for port, counts in counters.inputs.items()
-        for what in ("refused", "repeated", "lost", "dropped", "late")
-        if (number := getattr(counts, what))
-    ]
-    if counters.refused:
-        troubles.append(f"{counters.refused} refused")
-    return "; ".join(filter(None, [", ".join(given), *troubles]))
+    return "; ".join(filter(None, [", ".join(given), *troubles(counters)]))
 
 
 def _recorder(

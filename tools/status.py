@@ -10,7 +10,7 @@ import typer
 from caneflow.messages.control import Delays, EdgeStatus, FlowStatus, NodeStatus
 from caneflow.options import At, Keys
 from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
-from caneflow.runtime.wording import in_columns
+from caneflow.runtime.wording import in_columns, span
 
 PLACES = ("sender", "wire", "decode", "queue", "late")  # where a sample may be lost, on its way
 STALE = 3.0  # s without word from a node that says its counters once a second
@@ -60,7 +60,7 @@ def plain(status: FlowStatus) -> dict[str, Any]:
 def lines(status: FlowStatus) -> Iterator[str]:
     """The same for people."""
     kind = "replay" if status.replay else "live"
-    yield f"{status.flow}: {kind}, on {status.host}, caneflow {status.version}, up {_span(status.uptime)}"
+    yield f"{status.flow}: {kind}, on {status.host}, caneflow {status.version}, up {span(status.uptime)}"
     yield f"other programs attach at {status.endpoint}"
     yield ""
     head: tuple[str, ...] = ("node", "state", "pid", "up", "cpu", "memory", "restarts", "sent")
@@ -85,8 +85,8 @@ def _node(node: NodeStatus) -> tuple[str, ...]:
     sent = ", ".join(f"{port} {number}{_at_rate(node.rates[port])}" for port, number in node.sent.items())
     state = node.state
     if node.counted is not None and node.counted > STALE:
-        state += f", silent {_span(node.counted)}"
-    return node.node, state, str(node.pid or "-"), _span(node.uptime), cpu, memory, str(node.restarts), sent or "-"
+        state += f", silent {span(node.counted)}"
+    return node.node, state, str(node.pid or "-"), span(node.uptime), cpu, memory, str(node.restarts), sent or "-"
 
 
 def _edge(edge: EdgeStatus) -> tuple[str, ...]:
@@ -109,10 +109,3 @@ def _delays(delays: Delays) -> Iterator[str]:
 
 def _at_rate(rate: float | None) -> str:
     return "" if rate is None else f" at {rate:.1f} Hz"
-
-
-def _span(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02}:{rest:02} h"

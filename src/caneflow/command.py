@@ -6,7 +6,7 @@ from typing import NoReturn
 from caneflow import dispatch, interrupts, standard_streams
 
 # Words that are for their output alone: without a reader they end. The work of all others goes on.
-OUTPUT_ALONE = frozenset({"echo", "hz", "top", "info"})
+OUTPUT_ALONE = frozenset({"echo", "hz", "top", "info", "logs"})
 
 
 def program() -> NoReturn:

@@ -21,6 +21,7 @@ from caneflow.runtime.replayed import (
     REPLAYER_MODULE,
     LeftOutStamps,
     Replay,
+    last_of,
     left_out_of,
     origin_of,
     outputs_of,
@@ -42,6 +43,7 @@ class Deployment:
     flow: str
     plans: dict[str, NodePlan]
     origin: int = 0  # ns: the stamp at which a replay begins
+    last: int | None = None  # ns: the last stamp of a replay; None: a loop has none, nor does a live run
     site: Site | None = None  # when the flow runs on several machines
     door: Site | None = None  # when it runs on one, and others may listen there
     links: Literal["unix", "tcp"] = "unix"  # between the processes of this machine
@@ -50,6 +52,11 @@ class Deployment:
     def replay(self) -> bool:
         """Whether the sources are recordings."""
         return any(plan.replay for plan in self.plans.values())
+
+    @property
+    def streams(self) -> dict[str, tuple[str, ...]]:
+        """By node its output ports."""
+        return {name: tuple(plan.outputs) for name, plan in self.plans.items()}
 
     def runs_here(self, node: str) -> bool:
         """Whether this launcher starts `node`."""
@@ -99,12 +106,13 @@ def deploy(
     if unknown := without - graph.nodes.keys():
         raise DataflowError(f"--without {min(unknown)}: no such node; there are {', '.join(graph.nodes)}")
     nodes = {name: node for name, node in graph.nodes.items() if name not in without}
-    origin, base_rig = 0, graph.rig
+    origin, last, base_rig = 0, None, graph.rig
     if replay is None:
         plans = {name: _plan(graph, node, nodes) for name, node in nodes.items()}
     else:
         with Recording(replay.recording) as recording:
             origin = origin_of(recording, replay)
+            last = last_of(recording, replay, origin)
             base_rig = overlaid(graph.rig, recording.rig)
             left_out = left_out_of(graph, recording)
             plans = {
@@ -130,7 +138,7 @@ def deploy(
     opens = site is None and (machine is not None or replay is None or listen is not None)
     door = door_of(graph, listen) if opens else None
     _require_open(graph, plans, site or door)
-    return Deployment(flow=graph.flow, plans=plans, origin=origin, site=site, door=door, links=graph.links)
+    return Deployment(flow=graph.flow, plans=plans, origin=origin, last=last, site=site, door=door, links=graph.links)
 
 
 def _require_open(graph: Graph, plans: Mapping[str, NodePlan], here: Site | None) -> None:

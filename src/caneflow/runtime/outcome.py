@@ -16,9 +16,26 @@ class Outcome:
     unrecorded: list[str] = field(default_factory=list)  # why the recording of a live flow is incomplete
 
     @property
+    def lost(self) -> tuple[str, ...]:
+        """A line for each node with what did not arrive, could not be used or was not recorded."""
+        told = (f"{node}: {'; '.join(troubles(counters))}" for node, counters in self.counters.items())
+        return (*(line for line in told if not line.endswith(": ")), *self.unrecorded)
+
+    @property
     def status(self) -> int:
         """The command's exit status."""
         return 1 if self.failures else 130 if self.interrupted else 1 if self.unrecorded else 0
+
+
+def troubles(counters: Counters) -> list[str]:
+    """What a node counted that should not have been, port by port."""
+    found = [
+        f"{port}: {number} {what}"
+        for port, counts in counters.inputs.items()
+        for what in ("refused", "repeated", "lost", "dropped", "late")
+        if (number := getattr(counts, what))
+    ]
+    return [*found, f"{counters.refused} refused"] if counters.refused else found
 
 
 def note_losses(outcome: Outcome) -> None:

@@ -138,6 +138,14 @@ def origin_of(recording: Recording, replay: Replay) -> int:
     return first + round(replay.start_s * 1e9)
 
 
+def last_of(recording: Recording, replay: Replay, origin: int) -> int | None:
+    """The last stamp (ns) of the replay that begins at the stamp `origin`; None: it begins again and again."""
+    if replay.loop:
+        return None
+    _, last = _span(recording)
+    return last if replay.duration_s is None else min(last, origin + round(replay.duration_s * 1e9))
+
+
 def require_stamps(recording: Recording, replay: Replay, origin: int, plans: Mapping[str, NodePlan]) -> None:
     """Raise DataflowError for a stream whose stamps go back or are not its samples', up to the end of the replay.
 

@@ -51,3 +51,11 @@ def did_you_mean(word: str, names: Iterable[str], *, likeness: float = 0.6) -> s
     """` did you mean 'x'?` for the closest of `names`, or nothing when none is as close as `likeness` (0..1)."""
     close = get_close_matches(word[:LONGEST], list(islice(names, MOST_NAMES)), n=1, cutoff=likeness)
     return f" did you mean {close[0]!r}?" if close else ""
+
+
+def span(seconds: float) -> str:
+    """A time that has passed, in s or, above two minutes, in hours, minutes and seconds."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02} h"

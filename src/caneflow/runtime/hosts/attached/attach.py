@@ -201,17 +201,31 @@ def merged(answers: Sequence[FlowStatus]) -> FlowStatus:
         nodes=nodes,
         edges=edges,
         rig=next((answer.rig for answer in answers if answer.rig), {}),
+        endpoint=first.endpoint,
     )
 
 
 def endpoint_of(flow: str | None) -> str:
     """Where tools attach to the flow on this machine; raises DataflowError when there is none, or several."""
+    found = launchers_of(flow)[0]
+    if found.owner:
+        log.warning("%s (pid %d)%s", found.flow, found.pid, _of_whom(found))
+    return found.endpoint
+
+
+def launchers_of(flow: str | None) -> list[RunningFlow]:
+    """The launcher of the flow on this machine, or those of its parts; raises DataflowError as `endpoint_of` does.
+
+    `flow`: its name, or the pid of a launcher; None: the only one.
+    """
     running = running_flows()
+    if flow is not None and flow.isdigit() and (chosen := [found for found in running if str(found.pid) == flow]):
+        return chosen
     fitting = [found for found in running if flow in (None, found.flow)]
     # Root also sees those of other users, which must not stand in the place of its own.
     fitting = [found for found in fitting if not found.owner] or fitting
     if len(fitting) == 1:
-        return _where(fitting[0])
+        return fitting
     if not running:
         refused = "".join(f"; {said}" for said in refused_addresses())
         raise DataflowError(
@@ -225,16 +239,9 @@ def endpoint_of(flow: str | None) -> str:
     if flow is None and len(names) > 1:
         raise DataflowError(f"several flows run on this machine; name one of {listed(names)}")
     if _are_one(fitting):
-        return _where(fitting[0])
+        return fitting
     each = listed(f"--at {found.endpoint} (pid {found.pid}{_of_whom(found)})" for found in fitting)
     raise DataflowError(f"{len(fitting)} flows {fitting[0].flow!r} run on this machine; choose by {each}")
-
-
-def _where(found: RunningFlow) -> str:
-    """Its endpoint; that it is another user's, which only root sees, is said."""
-    if found.owner:
-        log.warning("%s (pid %d)%s", found.flow, found.pid, _of_whom(found))
-    return found.endpoint
 
 
 def _of_whom(found: RunningFlow) -> str:

@@ -3,13 +3,13 @@
 import signal
 import sys
 import time
-from collections.abc import Callable
 
 from caneflow.runtime.dataflow.graph import Restart
 from caneflow.runtime.hosts.launcher.node_state import NodeState
 from caneflow.runtime.hosts.launcher.processes import Exited
 from caneflow.runtime.hosts.launcher.restarts import Again, How
 from caneflow.runtime.hosts.launcher.stop_signals import signal_name
+from caneflow.runtime.hosts.launcher.watcher import Say
 from caneflow.runtime.outcome import Outcome
 
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)  # of a program by itself
@@ -25,9 +25,8 @@ FAILING_SAID = 60.0  # s after which the launcher says again that the flow goes 
 class Ends:
     """Decides by each node's policy, tells, and notes what failed for good."""
 
-    def __init__(self, report: Callable[[str, str], None], outcome: Outcome) -> None:
-        """`report` takes a node and a line."""
-        self._report = report
+    def __init__(self, say: Say, outcome: Outcome) -> None:
+        self._say = say
         self._outcome = outcome
 
     def exited(self, node: NodeState, exited: Exited, *, begun: bool) -> None:
@@ -64,7 +63,7 @@ class Ends:
         node.restart_at = now + verdict.delay_s
         again = f"restart {node.policy.counted} of {node.policy.allowed} in {verdict.delay_s:g} s"
         said = f": {node.last_words.error}" if node.last_words else ""
-        self._report(name, f"{cause}{said}; {again}")
+        self._say(name, f"{cause}{said}; {again}", "warning")
 
     def _go_on_without(self, node: NodeState, cause: str, delay_s: float) -> None:
         """Have a spare node started again some time; say that it is missing, and say it again now and then."""
@@ -78,4 +77,5 @@ class Ends:
         if now >= node.say_at:
             node.say_at = now + FAILING_SAID
             said = f": {node.last_words.error}" if node.last_words else ""
-            self._report(node.plan.node, f"{cause}{said}; THE FLOW GOES ON WITHOUT ITS RECORDING and tries again")
+            lost = "THE FLOW GOES ON WITHOUT ITS RECORDING and tries again"
+            self._say(node.plan.node, f"{cause}{said}; {lost}", "error")

@@ -7,9 +7,11 @@ from typing import Any
 
 import zenoh
 
-from caneflow.messages import control_key
-from caneflow.messages.control import Counters, Progress
+from caneflow.messages import MEDIA_TYPE, control_key, encode
+from caneflow.messages.control import Counters, FlowStatus, Progress
 from caneflow.runtime.hosts.launcher.congestion import closing_at_once
+
+STATUS = "caneflow.FlowStatus/1"
 
 
 @dataclass(frozen=True)
@@ -68,3 +70,10 @@ def hearing(
         held.append(session.declare_subscriber(control_key(flow, "progress", "*"), said(Progress)))
     yield
     held.clear()  # they end with the session
+
+
+def answer_status(query: zenoh.Query, status: FlowStatus) -> None:
+    """Tell whoever asked how the flow is."""
+    with query:
+        encoding = zenoh.Encoding(MEDIA_TYPE).with_schema(STATUS)
+        query.reply(control_key(status.flow, "status"), encode(status), encoding=encoding)

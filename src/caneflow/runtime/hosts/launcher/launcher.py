@@ -9,27 +9,32 @@ from pathlib import Path
 
 import zenoh
 
-from caneflow.messages import MEDIA_TYPE, control_key, encode
+from caneflow.messages import control_key, encode
 from caneflow.messages.control import Window
 from caneflow.runtime.dataflow.graph import Restart
 from caneflow.runtime.deployment import Deployment, with_recorders_on
+from caneflow.runtime.hosts.launcher.asked_restarts import AskedRestarts
 from caneflow.runtime.hosts.launcher.clocks import Answer, Clocks
 from caneflow.runtime.hosts.launcher.companions import Began, Companions, Ended, Failed, Joined, Left
 from caneflow.runtime.hosts.launcher.congestion import closed_in_time
 from caneflow.runtime.hosts.launcher.ends import Ends
 from caneflow.runtime.hosts.launcher.fork_server import ForkServer
-from caneflow.runtime.hosts.launcher.hearing import Ready, Said, StatusAsked, hearing
+from caneflow.runtime.hosts.launcher.hearing import Ready, Said, StatusAsked, answer_status, hearing
 from caneflow.runtime.hosts.launcher.launcher_session import listening, open_launcher_session
 from caneflow.runtime.hosts.launcher.linking import linked
 from caneflow.runtime.hosts.launcher.node_state import NodeState
-from caneflow.runtime.hosts.launcher.nodes import LAUNCHER, Nodes, Report
+from caneflow.runtime.hosts.launcher.nodes import LAUNCHER, Nodes
 from caneflow.runtime.hosts.launcher.private_folder import PrivateFolder
 from caneflow.runtime.hosts.launcher.processes import Exited, ForkServerLost, Line, Processes
+from caneflow.runtime.hosts.launcher.replay_progress import ReplayProgress
 from caneflow.runtime.hosts.launcher.replay_window import ReplayWindow
+from caneflow.runtime.hosts.launcher.requests import RestartAsked, requests
 from caneflow.runtime.hosts.launcher.restarts import How
 from caneflow.runtime.hosts.launcher.run_directory import RunDirectory, remove_state_folder, state_folder
+from caneflow.runtime.hosts.launcher.run_log import RunLog
 from caneflow.runtime.hosts.launcher.starting import plan_to_start, program_arguments
 from caneflow.runtime.hosts.launcher.stop_signals import Interrupted, stop_signals
+from caneflow.runtime.hosts.launcher.watcher import Watcher
 from caneflow.runtime.hosts.links.session import local_links
 from caneflow.runtime.outcome import Outcome, note_losses
 from caneflow.runtime.stages.merge import BEGIN
@@ -37,7 +42,6 @@ from caneflow.runtime.stages.merge import BEGIN
 STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them: 5 s in all
 LEADER_PATIENCE = 120.0  # s that the part of a replay waits for its leader to come back
 WAITING_SAID = 10.0  # s after which a launcher says again whom it waits for
-STATUS = "caneflow.FlowStatus/1"
 WAKE_PERIOD = 0.2  # s between two looks at deadlines
 
 
@@ -48,7 +52,7 @@ class Launcher:
         self,
         deployment: Deployment,
         restarts: dict[str, Restart],
-        report: Report,
+        watcher: Watcher,
         fork_server: ForkServer,
         keys: Path | None = None,
     ) -> None:
@@ -58,17 +62,18 @@ class Launcher:
         self._keys = keys
         self._events: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._restarts = restarts
-        self._report = report
+        self._watcher = watcher
         self._deployment = deployment
         self._companions = Companions.of(deployment)
         self._leads = self._companions is None or self._companions.site.leads
         site = deployment.site
         self._clocks = None if site is None else Clocks(deployment.flow, site.name, site.others)
-        self._nodes = Nodes(report)
+        self._nodes = Nodes(self._say)
         self._started_s: float | None = None  # monotonic; None: not every node was ready yet
         self._window = ReplayWindow(deployment.origin)
+        self._progress = ReplayProgress(deployment.origin, deployment.last, watcher.played)
         self._outcome = Outcome()
-        self._ends = Ends(report, self._outcome)
+        self._ends = Ends(self._say, self._outcome)
         self._state_folder: PrivateFolder | None = None
         self._said_removed = False
         self._endpoint = ""  # where it listens for its nodes
@@ -82,16 +87,19 @@ class Launcher:
             closed_in_time(
                 open_launcher_session(deployment, self._run, endpoint := ports.endpoint(), self._keys), [endpoint]
             ) as self._session,
+            RunLog(self._directory.root, deployment.flow, replay=replay) as self._log,
             hearing(self._session, deployment.flow, self._events.put, progress=self._leads and replay),
-            self._directory.announced(endpoint),  # tools may attach from here on
+            self._directory.announced(endpoint, deployment.streams),  # tools may attach from here on
+            requests(self._directory.folder, self._events.put),
             Processes(self._events, self._fork_server) as self._processes,
             stop_signals(self._events.put),
         ):
             self._endpoint = endpoint
+            self._asked = AskedRestarts(self._nodes, self._processes, self._start, self._say)
             if self._directory.remark:
-                self._report(LAUNCHER, f"{self._directory.remark}; this run is in {self._directory.path}")
+                self._say(LAUNCHER, f"{self._directory.remark}; this run is in {self._directory.path}")
             if deployment.door is not None:
-                self._report(LAUNCHER, listening(deployment.door))
+                self._say(LAUNCHER, listening(deployment.door))
             if self._gather():
                 self._take_nodes(linked(self._deployment, ports, endpoint))
                 for node in self._nodes.here:
@@ -101,7 +109,7 @@ class Launcher:
                 self._companions.part(self._session, deployment.flow, self._outcome)
             self._stop()
             self._let_others_leave()
-        self._conclude()
+            self._conclude()
         return self._outcome
 
     # --- the other machines -----------------------------------------------------------------------------------
@@ -112,15 +120,16 @@ class Launcher:
         if companions is None:
             return True
         companions.join(self._session, self._deployment.flow, self._events.put)
+        self._watcher.settled()
         if self._clocks is not None:
             self._clocks.open(self._session, self._events.put)
-        self._report(LAUNCHER, f"{companions.site.leader} leads; {companions.waits_for(self._session)}")
+        self._say(LAUNCHER, f"{companions.site.leader} leads; {companions.waits_for(self._session)}")
         later = []
         say_again = time.monotonic() + WAITING_SAID
         while companions.missing and not self._is_over():
             if time.monotonic() > say_again:
                 say_again += WAITING_SAID
-                self._report(LAUNCHER, f"still {companions.waits_for(self._session)}")
+                self._say(LAUNCHER, f"still {companions.waits_for(self._session)}")
             for event in self._next_events():
                 if isinstance(event, Ready | Said | Began):
                     later.append(event)
@@ -161,6 +170,7 @@ class Launcher:
                 self._take(event)
             self._look_at_folder()
             self._look_at_deadlines()
+            self._asked.look()
             self._open_window()
             if self._clocks is not None:
                 self._clocks.look()
@@ -185,8 +195,11 @@ class Launcher:
                 self._begin_if_all_are_ready()
             case Exited():
                 self._processes.forget(event)
-                self._ends.exited(self._nodes[event.node], event, begun=self._started_s is not None)
+                if not self._asked.ended(event):
+                    self._ends.exited(self._nodes[event.node], event, begun=self._started_s is not None)
                 self._begin_if_all_are_ready()
+            case RestartAsked():
+                self._asked.take(event, replay=self._deployment.replay)
             case Interrupted():
                 self._outcome.interrupted = True
             case ForkServerLost():
@@ -198,17 +211,12 @@ class Launcher:
             case Joined() | Left() | Ended() | Failed() if self._companions is not None:
                 said = self._companions.hear(event, self._outcome, replay=self._deployment.replay)
                 if said is not None:
-                    self._report(LAUNCHER, said)
+                    self._say(LAUNCHER, said)
             case Answer() if self._clocks is not None:
                 if (said := self._clocks.take(event)) is not None:
-                    self._report(LAUNCHER, said)
+                    self._say(LAUNCHER, said)
             case StatusAsked(query):
-                with query:
-                    query.reply(
-                        control_key(self._deployment.flow, "status"),
-                        encode(self._nodes.status(self._deployment, self._endpoint)),
-                        encoding=zenoh.Encoding(MEDIA_TYPE).with_schema(STATUS),
-                    )
+                answer_status(query, self._nodes.status(self._deployment, self._endpoint))
 
     def _begin_if_all_are_ready(self) -> None:
         if self._started_s is None and self._leads and self._nodes.all_ready:
@@ -218,6 +226,8 @@ class Launcher:
     def _begin(self) -> None:
         if self._started_s is None:
             self._started_s = time.monotonic()
+            self._say(LAUNCHER, f"ready: {len(self._nodes.here)} nodes; to look: caneflow view {self._deployment.flow}")
+            self._watcher.settled()
 
     # --- what goes out ----------------------------------------------------------------------------------------
 
@@ -256,7 +266,7 @@ class Launcher:
                 if self._deployment.links == "unix"
                 else "tools cannot find it by its name any more"
             )
-            self._report(LAUNCHER, f"{self._directory.path} was removed: the flow goes on, but {lost}")
+            self._say(LAUNCHER, f"{self._directory.path} was removed: the flow goes on, but {lost}")
 
     def _look_at_deadlines(self) -> None:
         now = time.monotonic()
@@ -277,6 +287,7 @@ class Launcher:
             return
         if self._window.to_be_said(self._nodes.handled, time.monotonic()):
             self._tell("window", encode(Window(self._window.until)))
+        self._progress.look(self._nodes.handled)
 
     def _say_start(self) -> None:
         self._tell("start", b"")
@@ -286,6 +297,10 @@ class Launcher:
     def _tell(self, what: str, payload: bytes) -> None:
         key = control_key(self._deployment.flow, what)
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def _say(self, node: str, line: str, level: str = "") -> None:
+        self._log.take(node, line, level)
+        self._watcher.line(node, line)
 
     def _is_over(self) -> bool:
         over = self._companions is not None and self._companions.over
@@ -303,7 +318,7 @@ class Launcher:
         killed = self._processes.end(sources, operators, patience=STOP_PATIENCE)
         killed += self._processes.end(sinks, patience=STOP_PATIENCE - 0.5)
         for name in killed:
-            self._report(name, f"did not end within {STOP_PATIENCE:g} s; killed")
+            self._say(name, f"did not end within {STOP_PATIENCE:g} s; killed", "warning")
             if self._nodes[name].spare:
                 self._outcome.unrecorded.append(f"{name}: the recording is incomplete: it was killed at the end")
         while not self._events.empty():
@@ -323,3 +338,6 @@ class Launcher:
             failures, self._outcome.failures = self._outcome.failures, []
             note_losses(self._outcome)
             self._outcome.failures += failures  # last, as it is the cause
+        for failure in self._outcome.failures:
+            self._log.take(LAUNCHER, failure, "error")
+        self._log.end(self._outcome.status, self._outcome.lost)

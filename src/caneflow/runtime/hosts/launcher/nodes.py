@@ -1,7 +1,7 @@
 """The nodes of a run as their launcher follows them: what they say, whether all are ready, whether all have ended."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from caneflow.messages import MessageError, decode
 from caneflow.messages.control import Counters, FlowStatus, Progress
@@ -12,18 +12,17 @@ from caneflow.runtime.hosts.launcher.hearing import Said
 from caneflow.runtime.hosts.launcher.node_state import NodeState
 from caneflow.runtime.hosts.launcher.node_statistics import NodeStatistics
 from caneflow.runtime.hosts.launcher.restarts import Restarts
+from caneflow.runtime.hosts.launcher.watcher import Say
 from caneflow.runtime.stages.merge import END
 
 LAUNCHER = "caneflow"  # the launcher's name in the merged log
-
-Report = Callable[[str, str], None]  # (node, line)
 
 
 class Nodes:
     """Those that start here; at the leader those of all machines."""
 
-    def __init__(self, report: Report) -> None:
-        self._report = report
+    def __init__(self, say: Say) -> None:
+        self._say = say
         self._nodes: dict[str, NodeState] = {}
         self._statistics = NodeStatistics()
 
@@ -90,15 +89,15 @@ class Nodes:
 
     def take_line(self, name: str, text: str) -> None:
         """Report a line that a node wrote."""
-        for line in self[name].take_line(text):
-            self._report(name, line)
+        for line, level in self[name].take_line(text):
+            self._say(name, line, level)
 
     def take_said(self, said: Said) -> None:
         """Note what a node says of its progress, or of what it counted."""
         try:
             message = decode(said.payload, said.kind)
         except MessageError as error:
-            self._report(LAUNCHER, f"a {said.kind.__name__} refused: {error}")
+            self._say(LAUNCHER, f"a {said.kind.__name__} refused: {error}", "warning")
             return
         if isinstance(message, Counters):
             self._statistics.note(message)
@@ -111,7 +110,7 @@ class Nodes:
             return
         if node.here:
             for line in self._statistics.grown_old(message):
-                self._report(message.node, line)
+                self._say(message.node, line, "warning")
         node.counters = message
         if message.ended:
             node.handled = END
@@ -127,7 +126,7 @@ class Nodes:
         now = time.monotonic()
         node.policy.ready(now)
         if node.failing_since is not None:
-            self._report(name, f"is there again, after {now - node.failing_since:.1f} s")
+            self._say(name, f"is there again, after {now - node.failing_since:.1f} s")
             node.failing_since = None
 
     def look(self) -> None:

@@ -97,6 +97,11 @@ class Processes:
         if process is not None and process.pid == exited.pid:
             del self._running[exited.node]
 
+    def ask_to_end(self, node: str) -> None:
+        """Ask a node's process to end, and go on."""
+        if node in self._running:
+            _signal(self._running[node], signal.SIGTERM)
+
     def kill(self, node: str) -> None:
         """End a node's process at once."""
         if node in self._running:

@@ -51,6 +51,12 @@ class Restarts:
         if self._up_since is None:
             self._up_since = now
 
+    def asked(self, now: float) -> None:
+        """Note an end at `now` (s) that somebody asked for: it does not count, and begins a new time of being up."""
+        if self._up_since is not None and now - self._up_since >= self._policy.window_s:
+            self.counted = 0
+        self._up_since = None
+
     def ended(self, now: float, handled: object, how: How) -> Again | Failed:
         """Judge an end at `now` (s).
 
@@ -58,9 +64,7 @@ class Restarts:
         state each time, so a second fault there is final.
         """
         policy = self._policy
-        if self._up_since is not None and now - self._up_since >= policy.window_s:
-            self.counted = 0
-        self._up_since = None
+        self.asked(now)
         if policy.policy == "never":
             return Failed("")
         if how is How.LASTING:

@@ -9,9 +9,10 @@ import pwd
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 
 import msgspec
 import psutil
@@ -23,6 +24,7 @@ from caneflow.runtime.hosts.links.session import UNIX
 from caneflow.runtime.wording import shown
 
 ADDRESS = "flow.json"
+NAMES = "names.json"  # what there is to be named on a command line, for shells that complete it
 LONGEST_ADDRESS = 4096  # bytes of flow.json
 SHOWN_OF_FLOW = 20  # letters of the flow's name in the run folder's: paths of sockets are short
 OTHERS_WRITE = 0o002
@@ -38,6 +40,7 @@ class RunningFlow(msgspec.Struct, frozen=True):
     pid: int  # of its launcher
     endpoint: str  # where tools attach, as Zenoh clients
     owner: str = ""  # the other user whose flow it is; "": this user's own
+    folder: str = ""  # of the run
 
 
 class RunDirectory:
@@ -53,40 +56,46 @@ class RunDirectory:
         self.remark = ""  # why the run is not in the usual place, if it is not
 
     def __enter__(self) -> "RunDirectory":
-        self._root, self.remark = _own_root()
-        _sweep(self._root)
-        self._root.remove(self._name)  # of a process that was killed and had the same pid
-        self._folder = self._root.child(self._name)
-        self.path = self._folder.path
+        self.root, self.remark = _own_root()
+        _sweep(self.root)
+        self.root.remove(self._name)  # of a process that was killed and had the same pid
+        self.folder = self.root.child(self._name)
+        self.path = self.folder.path
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._root.remove(self._name)
-        self._folder.close()
-        self._root.close()
+        self.root.remove(self._name)
+        self.folder.close()
+        self.root.close()
 
     @contextmanager
-    def announced(self, endpoint: str) -> Iterator[None]:
-        """Tell tools that they may attach to `endpoint`, while the block lasts."""
+    def announced(self, endpoint: str, names: Mapping[str, Iterable[str]] = MappingProxyType({})) -> Iterator[None]:
+        """Tell tools that they may attach to `endpoint`, while the block lasts; `names`: by node its output ports."""
         if endpoint.startswith(f"{UNIX}/"):
             self._socket = Path(endpoint.removeprefix(f"{UNIX}/"))
         running = {"flow": self._flow, "pid": os.getpid(), "endpoint": endpoint}
-        self._folder.write(ADDRESS, msgspec.json.encode(running))
+        self.folder.write(NAMES, msgspec.json.encode({node: tuple(ports) for node, ports in names.items()}))
+        self.folder.write(ADDRESS, msgspec.json.encode(running))
         try:
             yield
         finally:
-            self._folder.remove(ADDRESS)
+            self.folder.remove(ADDRESS)
 
     @property
     def is_there(self) -> bool:
         """Whether the folder and the launcher's socket are where they were made: a cleaner may have removed them."""
-        return self._folder.is_there and (self._socket is None or self._socket.exists())
+        return self.folder.is_there and (self._socket is None or self._socket.exists())
 
 
 def running_flows() -> list[RunningFlow]:
     """The flows that run on this machine and that this user may believe: the own ones; root sees all."""
     found = {flow.pid: flow for flow in _found() if isinstance(flow, RunningFlow)}
     return sorted(found.values(), key=lambda flow: (flow.flow, flow.pid))
+
+
+def run_roots() -> list[Path]:
+    """The folders that may hold the runs of this user, or, for root, of others."""
+    return _roots()
 
 
 def refused_addresses() -> list[str]:
@@ -126,7 +135,7 @@ def _read_address(path: Path, folder: int, pid: int, owner: int) -> Iterator[Run
     elif not _is_address_in(path, folder, owner, written.endpoint):
         yield f"{path / ADDRESS}: {shown(written.endpoint)} is not an endpoint of this folder or of 127.0.0.1"
     else:
-        yield RunningFlow(written.flow, pid, written.endpoint, _owner_name(owner))
+        yield RunningFlow(written.flow, pid, written.endpoint, _owner_name(owner), str(path))
 
 
 def _belongs_to(pid: int, owner: int) -> bool:

@@ -30,7 +30,7 @@ def plan_to_start(
     settings = dict(plan.settings)
     if started_s is not None and plan.module == REPLAYER_MODULE:
         settings["started_s"] = started_s
-    if node.restarts and plan.module == RECORDER_MODULE:
+    if node.started_again and plan.module == RECORDER_MODULE:
         settings["goes_on"] = True
     return msgspec.structs.replace(
         plan,
@@ -38,8 +38,8 @@ def plan_to_start(
         state_folder=str(state),
         # What a spare reader misses at the start it asks for: nobody waits for it, as it may never come.
         absent=(*out_of_reach, *spares),
-        takes_over=node.restarts > 0,
-        links=msgspec.structs.replace(plan.links, identity=node_id(run, plan.node, node.restarts)),
+        takes_over=node.started_again > 0,
+        links=msgspec.structs.replace(plan.links, identity=node_id(run, plan.node, node.started_again)),
     )
 
 
