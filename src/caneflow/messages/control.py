@@ -105,9 +105,9 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     node: str
     program: str
-    state: str  # starting, ready, waiting (for its restart), failed
+    state: str  # starting, ready, ending (to be started again), waiting (for its restart), failed
     pid: int
-    restarts: int
+    restarts: int  # after failures
     uptime: float  # s since its process was started
     cpu: float | None  # of one core, over the last second or so; 1.0 is a whole one
     memory: int | None  # bytes, resident
@@ -120,6 +120,7 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     connect: tuple[str, ...] = ()  # whom it dials: its launcher, and the writers of its inputs
     held: int = 0  # bytes of samples that it keeps: sent and not confirmed, or waiting to be handled
     let_go: int = 0  # samples sent that can no longer be had again, though some reader has not confirmed them
+    asked: int = 0  # restarts that somebody asked for, not among the others
 
 
 class EdgeStatus(msgspec.Struct, frozen=True, kw_only=True):

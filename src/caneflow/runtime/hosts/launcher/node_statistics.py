@@ -31,6 +31,7 @@ class ObservedNode(Protocol):
     state: str
     pid: int
     restarts: int
+    asked: int
     started_at: float
     counters: Counters | None
     last_line: str
@@ -160,6 +161,7 @@ class NodeStatistics:
             state=node.state,
             pid=node.pid,
             restarts=node.restarts,
+            asked=node.asked,
             uptime=now - (node.started_at or self._since),
             cpu=cost.cpu if cost else None,
             memory=cost.memory if cost else None,
