@@ -79,7 +79,7 @@ def test_a_run_has_a_folder_that_is_its_users_alone_and_held(common: Path) -> No
                 with pytest.raises(BlockingIOError):
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 os.close(descriptor)
-            assert running_flows() == [RunningFlow("cane", os.getpid(), HERE)]
+            assert running_flows() == [RunningFlow("cane", os.getpid(), HERE, folder=str(run.path))]
         assert not list(root.iterdir())
     finally:
         os.umask(before)
@@ -122,7 +122,7 @@ def test_a_folder_that_is_not_ours_is_not_used_and_the_run_is_found_elsewhere(co
             assert run.remark.startswith(f"{usual}: ") == (how != "755"), "one that others only read says nothing"
             assert (run.path.parent.parent, mode_of(run.path.parent)) == (common, 0o700)
             assert not list(trap.iterdir())
-            assert running_flows() == [RunningFlow("cane", os.getpid(), HERE)]
+            assert running_flows() == [RunningFlow("cane", os.getpid(), HERE, folder=str(run.path))]
             paths.append(run.path)
     assert paths[0] == paths[1], "the next run takes the folder that the first one made"
 
@@ -308,8 +308,8 @@ def test_a_folder_that_others_may_write_or_that_is_a_link_is_not_believed(common
 def test_root_sees_the_flow_of_another_user_and_says_whose(common: Path, caplog: pytest.LogCaptureFixture) -> None:
     name = pwd.getpwuid(STRANGER).pw_name
     with process_of(STRANGER) as theirs:
-        write_address(common / "caneflow-65534", theirs, owner=STRANGER)
-        assert running_flows() == [RunningFlow("cane", theirs, HERE, name)]
+        folder = write_address(common / "caneflow-65534", theirs, owner=STRANGER)
+        assert running_flows() == [RunningFlow("cane", theirs, HERE, name, str(folder))]
         assert attach.endpoint_of("cane") == HERE
         assert caplog.messages == [f"cane (pid {theirs}), of user {name}"]
         own = "tcp/127.0.0.1:20001"
