@@ -74,7 +74,8 @@ class RunDirectory:
         if endpoint.startswith(f"{UNIX}/"):
             self._socket = Path(endpoint.removeprefix(f"{UNIX}/"))
         running = {"flow": self._flow, "pid": os.getpid(), "endpoint": endpoint}
-        self.folder.write(NAMES, msgspec.json.encode({node: tuple(ports) for node, ports in names.items()}))
+        if names:
+            self.folder.write(NAMES, msgspec.json.encode({node: tuple(ports) for node, ports in names.items()}))
         self.folder.write(ADDRESS, msgspec.json.encode(running))
         try:
             yield
