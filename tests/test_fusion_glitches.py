@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from caneflow.algorithms.radar.ground_velocity import UNOBSERVED
 from caneflow.algorithms.rotations import from_rotation_vector, from_yaw, multiply
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample, encode, with_number
 from caneflow.messages.rig import read_rig
@@ -127,6 +128,39 @@ def test_a_wild_speed_does_not_last(method: Method, wild: str) -> None:
     bar = 1.2 * undisturbed_error(method) + 0.05
     for at in (EACH_SECOND, REST, (0,)):
         assert error(poses(method, spoilt(GroundSpeed, WILD_SPEEDS[wild], at))) < bar, f"at {at}"
+
+
+Claim = Callable[[float, float], tuple[float, float, float]]
+EXACT: dict[str, Claim] = {
+    "all of it": lambda xx, yy: (0.0, 0.0, 0.0),
+    "a tiny one": lambda xx, yy: (1e-30, 0.0, 1e-30),
+    "singular": lambda xx, yy: (xx, math.sqrt(xx * 1e-12), 1e-12),
+    "forward": lambda xx, yy: (0.0, 0.0, yy),
+    "sideways": lambda xx, yy: (xx, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("phase", [0, 10])
+@pytest.mark.parametrize("exact", EXACT)
+def test_velocities_that_claim_to_be_exact_do_not_outweigh_the_others(exact: str, phase: int) -> None:
+    """One a second, and three in a row every three seconds."""
+
+    def claim(sample: Imu | GroundSpeed) -> Sample:
+        assert isinstance(sample, GroundSpeed)
+        assert sample.velocity_cov is not None
+        xx, _, yy = sample.velocity_cov
+        return msgspec.structs.replace(sample, velocity_cov=EXACT[exact](xx, yy))
+
+    speeds = [each for each in undisturbed() if isinstance(each, GroundSpeed)]
+    seen = [
+        index
+        for index, each in enumerate(speeds)
+        if each.velocity_cov is not None and each.velocity_cov[0] < UNOBSERVED and each.velocity != (0.0, 0.0)
+    ]
+    in_a_row = [index for first in range(phase, len(seen), 60) for index in seen[first : first + 3]]
+    bar = undisturbed_error("best") + 0.02
+    for at in (seen[phase::20], in_a_row):
+        assert error(poses("best", spoilt(GroundSpeed, claim, at))) < bar
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
+from caneflow.algorithms.cane.speed_gate import StatedVariance
 from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
 from caneflow.algorithms.inertial.gyro_yaw import GyroYaw
 from caneflow.algorithms.inertial.heave import HeaveObserver, HeaveSettings
@@ -137,7 +138,8 @@ class CaneFilter:
         self._arm = self._arm_speed = 0j  # m, m/s in the gyro's frame: from the IMU to the hand, as of the last sample
         self._turns = _TurnDoubt()
         self._lonely = False  # the last velocity came after a silence
-        self._sees_left = False  # the last velocity observed its component to the left
+        self._forward_variance = StatedVariance(settings.speed_noise**2)
+        self._left_variance = StatedVariance(math.inf)
         self._radar_speed = 0.0  # m/s, the last
         self._field: Vector | None = None  # uT, body
         self._since_heading = self._since_sideways = 0.0  # s
@@ -174,11 +176,9 @@ class CaneFilter:
     ) -> None:
         """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
         (forward, left), (xx, _, yy) = velocity, covariance
-        # one sample alone that sees the way sideways while it moves is not believed: from the second on it is
-        sees_left, self._sees_left = self._sees_left, yy < _UNOBSERVED
-        if not sees_left and velocity != (0.0, 0.0):
-            yy = _UNOBSERVED
         if min(xx, yy) < _UNOBSERVED:
+            if velocity != (0.0, 0.0):  # at rest every component is seen, and as well as ever
+                xx, yy = self._forward_variance.believed(xx), self._left_variance.believed(yy)
             least = self._settings.velocity_error**2
             xx, yy = max(xx, least), max(yy, least)
             last_ns, self._last_velocity_ns = self._last_velocity_ns, stamp_ns
