@@ -8,7 +8,7 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from caneflow.algorithms.quantities import Fraction, Length, Zero
+from caneflow.algorithms.quantities import Fraction, Zero
 from caneflow.algorithms.room.resampling import effective_number, systematic
 
 Array = NDArray[np.float64]
@@ -21,7 +21,7 @@ class ParticleSettings:
     # The paper has 1000: then the filter ends elsewhere by a third of its error when one sample of a walk is lost.
     count: Annotated[int, Ge(10), Le(100_000)] = 4000
     resample_below: Fraction = 0.5  # of the count, effective number
-    smallest: Length | Zero = 1e-3  # of the mean weight; lighter particles are removed
+    smallest: Fraction | Zero = 1e-3  # of the mean weight; lighter particles are removed
 
 
 class Particles:
