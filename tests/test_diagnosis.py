@@ -21,7 +21,8 @@ from caneflow.messages import control_key, encode
 from caneflow.messages.control import Delays, EdgeStatus, FlowStatus, NodeStatus
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.attached import attach
-from caneflow.runtime.hosts.attached.diagnosis import Finding, diagnosed, way_to
+from caneflow.runtime.hosts.attached.diagnosis import diagnosed
+from caneflow.runtime.hosts.attached.way_to import Finding, way_to
 from caneflow.runtime.hosts.launcher.run_directory import RunningFlow
 from caneflow.runtime.hosts.links.certificates import credentials
 from caneflow.runtime.hosts.links.session import Ports, open_session

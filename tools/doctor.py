@@ -18,7 +18,8 @@ from caneflow.runtime import Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS
-from caneflow.runtime.hosts.attached.diagnosis import Finding, diagnosed
+from caneflow.runtime.hosts.attached.diagnosis import diagnosed
+from caneflow.runtime.hosts.attached.way_to import Finding
 
 TROUBLE_STATUS = 1
 CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {

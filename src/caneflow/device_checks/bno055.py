@@ -16,7 +16,7 @@ from caneflow.protocols.bno055_link import UartLink
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.register_link import I2cLink, Link
 from caneflow.runtime.dataflow.graph import Node
-from caneflow.runtime.hosts.attached.diagnosis import Finding
+from caneflow.runtime.hosts.attached.way_to import Finding
 
 PROBE_READS = 50
 MOST_OVERRUNS = 0.1  # part of the readings

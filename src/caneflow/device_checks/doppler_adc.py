@@ -7,7 +7,7 @@ from typing import Any
 from caneflow.errors import CaneflowError
 from caneflow.recording.sound_file import SoundFile
 from caneflow.runtime.dataflow.graph import Node
-from caneflow.runtime.hosts.attached.diagnosis import Finding
+from caneflow.runtime.hosts.attached.way_to import Finding
 
 NO_CARD = (
     "see what ALSA has: arecord -l; a card on USB has to be plugged in",

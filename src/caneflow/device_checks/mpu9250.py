@@ -13,7 +13,7 @@ from caneflow.protocols.mpu9250_chip import Chip as Mpu9250Chip
 from caneflow.protocols.mpu9250_chip import Setup
 from caneflow.protocols.register_link import I2cLink
 from caneflow.runtime.dataflow.graph import Node
-from caneflow.runtime.hosts.attached.diagnosis import Finding
+from caneflow.runtime.hosts.attached.way_to import Finding
 
 
 def examine(node: Node) -> Iterator[Finding]:

@@ -10,7 +10,7 @@ from caneflow.device_checks.ports import at_port, text_of
 from caneflow.protocols import mrm
 from caneflow.protocols.errors import ProtocolError
 from caneflow.runtime.dataflow.graph import Node
-from caneflow.runtime.hosts.attached.diagnosis import Finding
+from caneflow.runtime.hosts.attached.way_to import Finding
 
 ANSWER_TIME = 0.5  # s, of a radar
 ASKED = 4  # times

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 
 from caneflow.runtime.dataflow.graph import Node
-from caneflow.runtime.hosts.attached.diagnosis import Finding
+from caneflow.runtime.hosts.attached.way_to import Finding
 
 KERNEL_OPTIONS = Path("/proc/cmdline")
 I2C_NAMES = Path("/sys/class/i2c-dev")

@@ -19,7 +19,7 @@ from caneflow.physics import GRAVITY
 from caneflow.protocols.doppler_blocks import ModuleChannels
 from caneflow.runtime import Context, Quiet, Source
 from caneflow.runtime.dataflow.graph import Node
-from caneflow.runtime.hosts.attached.diagnosis import Finding
+from caneflow.runtime.hosts.attached.way_to import Finding
 
 ENOUGH = 0.97  # part of the rate that is asked for
 GRAVITY_TOLERANCE = 1.0  # m/s^2, between gravity by the orientation and by the accelerometer

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from caneflow.runtime.node import run
     from caneflow.runtime.program import (
         ANY_PORT,
         Brought,
@@ -30,12 +31,14 @@ __all__ = [
     "Refused",
     "Sink",
     "Source",
+    "run",
 ]
 
 
 def __getattr__(name: str) -> Any:
     # What programs are made of is imported when a program asks for it: `caneflow status` has to answer at once.
     if name in __all__:
-        value = globals()[name] = getattr(import_module("caneflow.runtime.program"), name)
+        home = "node" if name == "run" else "program"
+        value = globals()[name] = getattr(import_module(f"caneflow.runtime.{home}"), name)
         return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
