@@ -20,7 +20,7 @@ from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, Attitud
 from caneflow.algorithms.inertial.initial_attitude import AttitudeMethod
 from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
 from caneflow.algorithms.rotations import Vector
-from caneflow.protocols.imu_csv import ImuTable, Reading
+from caneflow.protocols.imu_csv import ImuTable, Joined, Reading
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 BROAD = DATA / "broad-imu" / "21_undisturbed_fast_combined.mat"
@@ -139,10 +139,12 @@ def steps() -> list[Reading]:
         columns[f"gyro_{axis}"] = f"Gyroscope {axis.upper()}"
         columns[f"accel_{axis}"] = f"Accelerometer {axis.upper()}"
     with GAIT.open(newline="") as lines:
-        rows = ImuTable(lines, columns=columns, units={"gyro": "deg/s", "accel": "g"})
-        readings = list(rows.readings())
-    assert str(rows.refusals) == "205 rows refused: 205 not later than the row before (first in line 4)"
-    return readings
+        rows = ImuTable(lines, columns=columns, units={})
+    assert rows.units["gyro"].unit == "deg/s"
+    assert rows.units["accel"].unit == "g"
+    assert rows.notes == ["205 rows written twice, taken once (first in line 4)"]
+    assert str(rows.refusals) == "no row left out"
+    return list(Joined([rows]).readings())
 
 
 def test_the_rows_that_the_importer_leaves_out_are_repetitions(steps: list[Reading]) -> None:

@@ -34,6 +34,8 @@ def wav(
     Files of up to 16 bits stay int16, others become float32; I and Q become complex64.
 
     Example: caneflow import wav walking.wav -o walking.mcap --carrier 24.1e9
+
+    I on the first channel and Q on the second: caneflow import wav iq.wav -o iq.mcap --quadrature 1
     """
     flow, stream = _flow_and_key(key)
     if quadrature == channel:
@@ -51,6 +53,9 @@ def wav(
                 seq, end = seq + 1, last + 1
     lacking = f"; {file.frames - end} of {file.frames} frames are not in the file" if end < file.frames else ""
     refused = f"; {file.refused} blocks left out: they hold what is no number" if file.refused else ""
+    if file.channels > 1 and quadrature is None:
+        others = ", ".join(str(other) for other in range(file.channels) if other != channel)
+        print(f"{sound}: channel {channel} of {file.channels}; --channel {others}, or --quadrature for I and Q")
     length = f"{end / file.sample_rate:.1f} s at {file.sample_rate:g} Hz"
     print(f"{output}: {seq} blocks, {length}, {file.subtype}{refused or lacking}")
 

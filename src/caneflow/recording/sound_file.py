@@ -33,7 +33,7 @@ class SoundFile:
             self.sample_rate = float(sound.samplerate)  # Hz
             self.frames = int(sound.frames)  # as its head says; a file that was cut off has fewer
             self.subtype = str(sound.subtype)
-            there = int(sound.channels)
+            self.channels = there = int(sound.channels)
         if not channels.needed <= there <= MOST_CHANNELS:
             of = "1 channel" if there == 1 else f"{there} channels"
             raise RecordingError(f"{self.path}: has {of}; channel {channels.needed - 1} is asked for (0 is the first)")
