@@ -1,17 +1,32 @@
 """Messages of a user's own: defined in their own file, known to every process, recorded and read back."""
 
+import importlib
 import json
+import re
 import subprocess
+import sys
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from caneflow.messages import Imu, numbered
-from caneflow.recording import RecordingWriter
+from caneflow.messages import Imu, Sample, decode, numbered, registry
+from caneflow.messages.arrays import to_bytes
+from caneflow.messages.rig import read_rig
+from caneflow.recording import Recorded, RecordingWriter
+from caneflow.recording.untyped_rows import untyped_rows
+from caneflow.runtime.dataflow.loading import examine
+from caneflow.runtime.hosts.attached.attach import Heard
+from caneflow.runtime.stages.snapshot import pack, unpack
+from caneflow.runtime.user_files import kind_at, module_of, place_of
+from caneflow.viewing.live import LiveStreams
 from tests.flows import CANEFLOW
+from tools.echo import told
 
 STEP = 10_000_000  # ns
 SAMPLES = 40
@@ -69,6 +84,18 @@ def project(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.fixture(autouse=True)
+def forgotten_afterwards(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a test imports from its folder is gone with it, as with a process."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    tables: tuple[dict[str, Any], ...] = (registry.SAMPLES, registry._definitions, sys.modules)
+    before = [dict(table) for table in tables]
+    yield
+    for table, old in zip(tables, before, strict=True):
+        for name in set(table) - set(old):
+            del table[name]
+
+
 def caneflow(project: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     done = subprocess.run([*CANEFLOW, *map(str, arguments)], cwd=project, capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
@@ -106,6 +133,86 @@ def test_every_host_carries_it_and_records_it_under_its_schema(project: Path) ->
     assert f"doubler/range: {SAMPLES} of {SAMPLES} samples equal in every byte" in verified.stdout, verified.stderr
 
 
+def test_who_does_not_know_the_type_shows_its_fields(project: Path) -> None:
+    """Those that the wire leaves out, as they are the default, are in the recorded JSON Schema."""
+    run(project, "out.mcap", "--in-process")
+    info = caneflow(project, "info", "out.mcap")
+    assert re.search(rf"^ranger/range +mine\.Range/1 +{SAMPLES} ", info.stdout, re.MULTILINE)
+    table = caneflow(project, "export", "out.mcap", "--format", "csv", "--stream", "ranger/range")
+    assert table.stderr == ""
+    assert table.stdout.splitlines()[:3] == [
+        "stamp,seq,distance,name",
+        "0,0,2.5,front",
+        f"{STEP},1,2.5,front",
+    ]
+    schema = caneflow(project, "schema", "ranges.py:Range").stdout
+    assert schema == caneflow(project, "schema", "out.mcap:mine.Range/1").stdout
+    assert json.loads(schema) == recorded(project / "out.mcap")["own/ranger/range"][1]
+    assert set(json.loads(caneflow(project, "schema", "own.yaml").stdout)) == {"caneflow.Imu/1", "mine.Range/1"}
+
+
+def test_an_external_node_may_send_it_and_a_recording_stands_in_for_that(project: Path) -> None:
+    whole = run(project, "whole.mcap", "--in-process")
+    external = [line for line in FLOW.splitlines() if "imu" not in line]
+    for named in ("Range", "./ranges.py:Range", "mine.Range/1"):
+        lines = [*external[:3], f"  ranger: {{external: true, outputs: {{range: {named}}}}}", *external[3:]]
+        (project / "own.yaml").write_text("\n".join(lines))
+        graph, _ = examine(project / "own.yaml")
+        assert graph is not None
+        assert graph.nodes["ranger"].outputs["range"].schema == "mine.Range/1"
+    done = caneflow(project, "run", "own.yaml", "--replay", "whole.mcap", "--record", "part.mcap", "--speed", "max")
+    assert done.returncode == 0, done.stderr
+    part = recorded(project / "part.mcap")
+    assert part == {key: whole[key] for key in ("own/ranger/range", "own/doubler/range")}
+
+
+def test_a_name_that_no_program_of_the_flow_defines_is_told_where_to_find(project: Path) -> None:
+    (project / "own.yaml").write_text("flow: own\nnodes:\n  front: {external: true, outputs: {range: mine.Range/1}}\n")
+    graph, [problem] = examine(project / "own.yaml")
+    assert graph is None
+    assert "no message 'mine.Range/1'" in problem.text
+    assert "a message of your own is named by its file and class, e.g. ./ranges.py:Range" in problem.text
+
+
+def test_echo_shows_what_msgpack_has() -> None:
+    fields = {"stamp": 1_500_000_000, "seq": 3, "distance": 2.5, "hits": list(range(9)), "about": {"on": True}}
+    heard = Heard("f/front/range", "mine.Distance/1", msgpack.packb(fields), 0)
+    line = told(heard, {}, as_json=False)
+    assert line == "front/range  3  1.500000000  distance=2.5 hits=(0, 1, 2, ..., 6, 7, 8) about={on=True}"
+    assert json.loads(told(heard, {}, as_json=True)) == {"stream": "front/range", "schema": "mine.Distance/1", **fields}
+    del fields["seq"]
+    heard = Heard("f/front/range", "mine.Distance/1", msgpack.packb(fields), 0)
+    assert told(heard, {}, as_json=False).startswith("front/range  refused: seq is missing")
+
+
+def test_view_counts_it_under_its_name() -> None:
+    streams = LiveStreams(flow="f", rig=read_rig({}))
+    streams.take("front/range", decode(msgpack.packb({"stamp": 5, "seq": 0, "distance": 2.5}), Sample), 6, "mine.Far/1")
+    batch = msgpack.unpackb(streams.batch())
+    assert batch["traffic"]["front/range"]["type"] == "mine.Far"
+    assert batch["traffic"]["front/range"]["count"] == 1
+
+
+def test_an_operator_may_keep_one_in_its_snapshot(project: Path) -> None:
+    (project / "kept_ranges.py").write_text(RANGES.replace("mine.Range", "mine.Kept"))
+    kind: Any = kind_at(f"{project / 'kept_ranges.py'}:Range")
+    assert place_of(kind) == f"{project / 'kept_ranges.py'}:Range"
+    assert importlib.import_module("kept_ranges").Range is kind
+    last = kind(stamp=1, distance=2.5, name="last")
+    assert unpack(pack({"last": last}, "__main__"), "__main__") == {"last": last}
+
+
+def test_a_file_that_was_edited_is_read_again_and_no_other(project: Path) -> None:
+    file = project / "edited_ranges.py"
+    file.write_text(RANGES.replace("mine.Range", "mine.Edited"))
+    first = module_of(file)
+    assert module_of(file) is first
+    file.write_text(RANGES.replace("mine.Range", "mine.Edited").replace("distance", "length"))
+    second = module_of(file)
+    assert {"length", "name"} < set(second.Range.__struct_fields__)
+    assert second is importlib.import_module("edited_ranges")
+
+
 def test_one_process_has_one_class_of_a_name_whichever_file_comes_first(project: Path) -> None:
     """`doubler` imports the message from the file of another node's program."""
     ranger = project / "ranger.py"
@@ -124,9 +231,9 @@ def test_two_files_that_define_one_schema_are_named_both(project: Path) -> None:
     (project / "others.py").write_text(RANGES.replace("distance", "length"))
     doubler = project / "doubler.py"
     doubler.write_text(doubler.read_text().replace("ranges", "others").replace("distance", "length"))
-    done = caneflow(project, "check", "own.yaml")
-    assert done.returncode == 1
-    [line] = (done.stdout + done.stderr).splitlines()
+    graph, [problem] = examine(project / "own.yaml")
+    assert graph is None
+    line = str(problem)
     assert "schema mine.Range/1 is defined twice, as Range in " in line
     assert f"{project / 'ranges.py'}:4 and as Range in {project / 'others.py'}:4" in line
 
@@ -145,6 +252,30 @@ def test_two_files_that_define_one_schema_are_named_both(project: Path) -> None:
 )
 def test_what_cannot_travel_is_refused_by_check(project: Path, written: str, instead: str, said: str) -> None:
     (project / "ranges.py").write_text(RANGES.replace(written, instead))
-    done = caneflow(project, "check", "own.yaml")
-    assert done.returncode == 1
-    assert said in done.stdout + done.stderr
+    graph, problems = examine(project / "own.yaml")
+    assert graph is None
+    assert said in str(problems[0])
+
+
+def test_rows_of_an_unknown_type_have_a_column_per_element_of_a_vector() -> None:
+    vector = {"type": "array", "minItems": 2, "maxItems": 2}
+    schema = {
+        "properties": {
+            "place": {"anyOf": [vector, {"type": "null"}]},
+            "hits": {"type": "array"},
+            "name": {"default": "front"},
+            "stamp": {},
+        }
+    }
+    field = np.zeros((2, 3), np.float32)
+    rows = [
+        {"stamp": 7, "seq": 0, "place": [1.5, 2.5], "hits": [], "field": msgpack.ExtType(1, to_bytes(field))},
+        {"stamp": 8, "seq": 1, "hits": [{"at": 1}], "name": "left"},
+    ]
+    samples = [Recorded("f/a/b", "a", "b", None, 0, 0, 0, msgpack.packb(row)) for row in rows]
+    assert list(untyped_rows(iter(samples), schema)) == [
+        ["stamp", "seq", "place_0", "place_1", "hits", "name", "field"],
+        [7, 0, 1.5, 2.5, "[]", "front", "float32[2, 3]"],
+        [8, 1, None, None, '[{"at": 1}]', "left", None],
+    ]
+    assert list(untyped_rows(iter([]), schema)) == []

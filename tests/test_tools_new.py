@@ -34,6 +34,7 @@ def test_programs_pass_their_own_tests_and_make_a_flow(caneflow: Callable[..., R
         assert (status, err) == (0, "")
         assert out.startswith(f"{tmp_path / name}.py: edit it; ")
         lines.append(out.splitlines()[-1].replace("imu/imu", "my_gyro/imu"))
+    assert caneflow("new", "message", "my_range", "--folder", tmp_path)[1].endswith("  from my_range import MyRange\n")
     file = tmp_path / "mine.yaml"
     file.write_text("\n".join(["flow: mine", "nodes:", *lines, "results: [smooth/imu]", ""]))
     graph, problems = examine(file)
@@ -50,6 +51,12 @@ def test_programs_pass_their_own_tests_and_make_a_flow(caneflow: Callable[..., R
         assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_a_message_is_not_called_as_a_module_of_python(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    status, _, err = caneflow("new", "message", "random", "--folder", tmp_path)
+    assert (status, list(tmp_path.iterdir())) == (2, [])
+    assert err.startswith("caneflow new: 'random' is a module of Python itself")
+
+
 def test_what_is_there_is_not_written_over(caneflow: Callable[..., Run], tmp_path: Path) -> None:
     mine = tmp_path / "test_smooth.py"
     mine.write_text("mine")
@@ -62,5 +69,5 @@ def test_what_is_there_is_not_written_over(caneflow: Callable[..., Run], tmp_pat
 def test_a_name_that_is_no_nodes_is_refused(caneflow: Callable[..., Run], tmp_path: Path, name: str) -> None:
     status, out, err = caneflow("new", "driver", name, "--folder", tmp_path)
     assert (status, out) == (2, "")
-    assert err.startswith(f"caneflow new: {name!r} is no name for a node: ")
+    assert err.startswith(f"caneflow new: {name!r} is not a valid name: ")
     assert not list(tmp_path.iterdir())

@@ -46,7 +46,9 @@ def is_printed(line: str, output: list[str]) -> bool:
 @pytest.mark.timeout(300)  # some 15 processes, one after the other
 def test_the_page_does_what_it_says(tmp_path: Path) -> None:
     page = blocks()
-    assert {block.language for block in page} == {"sh", "text", "yaml"}, "the test knows what to do with all of them"
+    assert {block.language for block in page} == {"sh", "text", "yaml", "python"}, (
+        "the test knows what to do with all of them"
+    )
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run(
         ["bash", "-c", as_script(page)],

@@ -5,22 +5,23 @@ import math
 import queue
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
-import msgspec
 import numpy as np
 import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, MessageError, Sample, decode
+from caneflow.messages.codec import fields_in, plain
+from caneflow.messages.registry import SCHEMA
 from caneflow.options import At, Keys
 from caneflow.printable import printable
 from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Heard, attached, parted
 
 MOST_WAITING = 10_000  # samples that may wait to be printed
-SHOWN = 3  # elements of an array on either side, on a line
+SHOWN = 3  # elements of an array or a list on either side, on a line
 
 
 def command(
@@ -98,51 +99,44 @@ def missed_told() -> Iterator[Missed]:
 
 
 def told(heard: Heard, kinds: dict[str, str], *, as_json: bool) -> str:
-    """One sample as a line; `kinds` are the schemas of the streams, for a writer that does not say its own."""
+    """One sample as a line; `kinds` are the schemas of the streams, for a writer that does not say its own.
+
+    Of a type that this program does not know, as a user's own, the fields are as msgpack has them.
+    """
     stream = heard.key.partition("/")[2]
-    kind = SAMPLES.get(heard.schema) or SAMPLES.get(kinds.get(stream, ""))
+    schema = heard.schema if SCHEMA.fullmatch(heard.schema) else kinds.get(stream, "")
     try:
-        if kind is None:
-            raise MessageError(f"a message of unknown type {heard.schema!r}")
-        message = decode(heard.payload, kind)
+        fields = fields_in(heard.payload, SAMPLES.get(schema))
     except MessageError as error:
         if as_json:
             return json.dumps({"stream": stream, "refused": str(error), "bytes": len(heard.payload)})
         return f"{stream}  refused: {error} ({len(heard.payload)} bytes)"
-    fields = {name: getattr(message, name) for name in message.__struct_fields__ if getattr(message, name) is not None}
+    there = {name: value for name, value in fields.items() if value is not None}
     if as_json:
-        return json.dumps({"stream": stream, "schema": kind.schema} | {k: _plain(v) for k, v in fields.items()})
-    told = " ".join(f"{k}={_short(v)}" for k, v in fields.items() if k not in ("stamp", "seq"))
-    return f"{stream}  {message.seq}  {_seconds(message)}  {told}"
+        return json.dumps({"stream": stream, "schema": schema} | {name: plain(value) for name, value in there.items()})
+    shown = " ".join(f"{name}={_short(value)}" for name, value in there.items() if name not in ("stamp", "seq"))
+    return f"{stream}  {fields['seq']}  {_seconds(fields['stamp'])}  {shown}"
 
 
-def _seconds(message: Sample) -> str:
-    return f"{message.stamp // 10**9}.{message.stamp % 10**9:09d}"
+def _seconds(stamp: int) -> str:
+    return f"{stamp // 10**9}.{stamp % 10**9:09d}"
 
 
 def _short(value: Any) -> str:
     match value:
         case float():
             return f"{value:.6g}"
-        case tuple():
-            return f"({', '.join(_short(each) for each in value)})"
+        case tuple() | list():
+            return f"({', '.join(_ends(value, _short))})"
+        case dict():
+            return f"{{{', '.join(_ends(list(value), lambda key: f'{key}={_short(value[key])}'))}}}"
         case np.ndarray():
-            flat = value.ravel()
-            ends = [*flat[:SHOWN], "...", *flat[-SHOWN:]] if flat.size > 2 * SHOWN else list(flat)
-            elements = " ".join(each if isinstance(each, str) else f"{each:.6g}" for each in ends)
-            return f"{value.dtype}{list(value.shape)}[{elements}]"
+            return f"{value.dtype}{list(value.shape)}[{' '.join(_ends(value.ravel(), lambda each: f'{each:.6g}'))}]"
     return str(value)
 
 
-def _plain(value: Any) -> Any:
-    """As JSON has it: an infinite value is its name, a complex one its two parts."""
-    match value:
-        case float() if not math.isfinite(value):
-            return str(value)
-        case complex():
-            return [value.real, value.imag]
-        case np.ndarray():
-            return _plain(value.tolist())
-        case list() | tuple():
-            return [_plain(each) for each in value]
-    return msgspec.to_builtins(value)
+def _ends(values: Any, show: Callable[[Any], str]) -> list[str]:
+    """The elements as text; of many only the first and the last."""
+    if len(values) <= 2 * SHOWN:
+        return [show(each) for each in values]
+    return [*map(show, values[:SHOWN]), "...", *map(show, values[-SHOWN:])]

@@ -14,10 +14,11 @@ import msgspec
 import typer
 from msgspec import inspect
 
-from caneflow.messages import Pose, Sample
+from caneflow.messages import SAMPLES, Pose, Sample
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
 from caneflow.recording import TRUTH, Recorded, Recording, RecordingError, Stream
+from caneflow.recording.untyped_rows import untyped_rows
 
 
 class Format(StrEnum):
@@ -83,7 +84,11 @@ def command(
         samples = source.samples([(chosen.node, chosen.port)])
         if form is Format.CSV:
             with _opened(path) as text:
-                write_csv(samples, text)
+                if chosen.schema in SAMPLES:
+                    write_csv(samples, text)
+                else:
+                    schema = source.json_schema(chosen.node, chosen.port)
+                    csv.writer(text, lineterminator="\n").writerows(untyped_rows(samples, schema))
         else:
             beside = output.with_suffix(COVARIANCES) if output and path and path.name == output.name else None
             with whole(beside, inputs=[recording], overwrite=overwrite) as covariances, _opened(path) as text:

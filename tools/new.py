@@ -1,5 +1,6 @@
-"""`caneflow new`: a program of your own that works, with its test and its line in dataflow.yaml."""
+"""`caneflow new`: a program or a message of your own that works, with its test and the line that uses it."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -181,6 +182,55 @@ def test_ticks_keep_their_rate_whatever_a_reading_takes() -> None:
 '''
 
 
+MESSAGE = '''"""The message CLASS, which travels between nodes. Import it from here: one file defines a schema."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from caneflow.messages import Sample
+from caneflow.messages.bounds import require_within
+
+FARTHEST = 100.0  # m
+
+
+class CLASS(Sample, frozen=True, kw_only=True):
+    """How far something is away. On the wire: one msgpack map; a new optional field keeps the version."""
+
+    schema = "mine.CLASS/1"
+
+    distance: Annotated[float, Meta(ge=0, le=FARTHEST, description="m, from the sensor")]
+    sensor: Annotated[str, Meta(max_length=32, description="which one")] = "front"
+
+    def __post_init__(self) -> None:
+        require_within("distance", self.distance, 0.0, FARTHEST, "m")  # here as well: also refuses NaN
+'''
+
+MESSAGE_TEST = '''"""What is sent is what is read, and what breaks the contract is refused on both sides."""
+
+import math
+
+import pytest
+
+from caneflow.messages import MessageError, decode, encode, with_number
+
+from NAME import FARTHEST, CLASS
+
+
+def test_what_is_sent_is_what_is_read() -> None:
+    sent = with_number(CLASS(stamp=1, distance=2.5, sensor="left"), 0)
+    assert decode(encode(sent), CLASS) == sent
+
+
+@pytest.mark.parametrize("distance", [-0.1, FARTHEST + 0.1, math.nan])
+def test_a_distance_out_of_bounds_is_refused(distance: float) -> None:
+    with pytest.raises(ValueError, match="distance is"):
+        CLASS(stamp=1, distance=distance)
+    with pytest.raises(MessageError, match="distance"):
+        decode(encode({"stamp": 1, "seq": 0, "distance": distance}), CLASS)  # type: ignore[arg-type]
+'''
+
+
 def operator(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Of the file and of the node, e.g. smooth.")],
     folder: Annotated[Path, typer.Option("--folder", metavar="DIR", help="Where to put the files.")] = Path(),
@@ -212,12 +262,39 @@ def driver(
     _write(name, folder, DRIVER, DRIVER_TEST, line, overwrite=overwrite)
 
 
-commands = {"operator": operator, "driver": driver}
+def message(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the file and of the message, e.g. range.")],
+    folder: Annotated[Path, typer.Option("--folder", metavar="DIR", help="Where to put the files.")] = Path(),
+    overwrite: Overwrite = False,
+) -> None:
+    """Write NAME.py, a message of your own, and test_NAME.py; print how programs take it.
+
+    A message is a class of fields with a schema of its own name. This one has a distance in m; put your fields in.
+
+    Example: caneflow new message range
+    """
+    if name in sys.stdlib_module_names:
+        raise CaneflowError(
+            f"{name!r} is a module of Python itself, which programs would import instead; use another name"
+        )
+    class_name = _write_files(name, folder, MESSAGE, MESSAGE_TEST, overwrite=overwrite)
+    print("into a program that sends or reads it:")
+    print(f"  from {name} import {class_name}")
+
+
+commands = {"operator": operator, "driver": driver, "message": message}
 
 
 def _write(name: str, folder: Path, program: str, test: str, line: str, *, overwrite: bool) -> None:
+    _write_files(name, folder, program, test, overwrite=overwrite)
+    print("into dataflow.yaml, under nodes:")
+    print(line)
+
+
+def _write_files(name: str, folder: Path, program: str, test: str, *, overwrite: bool) -> str:
+    """Write both files; gives the name of the class in them."""
     if not NAME.fullmatch(name):
-        raise CaneflowError(f"{name!r} is no name for a node: {NAME_RULE}")
+        raise CaneflowError(f"{name!r} is not a valid name: expected {NAME_RULE}")
     files = {folder / f"{name}.py": program, folder / f"test_{name}.py": test}
     for path in files:
         require_free(path, overwrite=overwrite)
@@ -227,5 +304,4 @@ def _write(name: str, folder: Path, program: str, test: str, line: str, *, overw
             fresh.write_text(text.replace("CLASS", class_name).replace("NAME", name), encoding="utf-8")
     program_path, test_path = files
     print(f"{program_path}: edit it; `pytest {test_path}` tests it without any process")
-    print("into dataflow.yaml, under nodes:")
-    print(line)
+    return class_name

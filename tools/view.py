@@ -22,6 +22,7 @@ from annotated_types import Ge, Le
 from caneflow.errors import CaneflowError
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.control import FlowStatus
+from caneflow.messages.registry import SCHEMA
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.options import At, Keys
 from caneflow.runtime import Context, Sink
@@ -135,9 +136,9 @@ def _relay(here: Attached, status: FlowStatus, streams: LiveStreams, *, local: b
 def _take(streams: LiveStreams, heard: Heard, received: int, kinds: dict[str, str]) -> None:
     with contextlib.suppress(ValueError, MessageError):  # the readers count and name what cannot be read
         name = "/".join(stream_of(heard.key))
-        kind = SAMPLES.get(heard.schema) or SAMPLES.get(kinds.get(name, ""))
-        if kind is not None:
-            streams.take(name, decode(heard.payload, kind), received)
+        schema = heard.schema if SCHEMA.fullmatch(heard.schema) else kinds.get(name, "")
+        message = decode(heard.payload, SAMPLES.get(schema, Sample))  # of a user's own type: its stamp and number
+        streams.take(name, message, received, schema)
 
 
 class _Inquiry:

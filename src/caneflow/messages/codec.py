@@ -1,5 +1,6 @@
 """Samples to msgpack and back, checked by type on the way in. No pickle, ever."""
 
+import math
 from functools import cache
 from typing import Any, TypeVar
 
@@ -12,6 +13,7 @@ from caneflow.messages.sample import Sample
 
 MAX_PAYLOAD = 32 * 2**20  # bytes; a 4 MB frame is the largest that anybody asked for
 MAX_SEQ = 2**40  # 35 years at 1 kHz; what is counted as lost must fit into a message as well, however often
+MOST_LEVELS = 32  # of maps and lists in a message whose type is not known
 MEDIA_TYPE = "application/msgpack"
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -41,17 +43,35 @@ def decode(payload: bytes, kind: type[S]) -> S:
     return message
 
 
-def decode_fields(payload: bytes) -> dict[str, Any]:
-    """The fields of a sample whose type is not known here, as msgpack has them: lists, maps, arrays.
+def fields_in(payload: bytes, kind: type[Sample] | None) -> dict[str, Any]:
+    """The fields of a sample by name, for people and files; raises MessageError as `decode` does.
 
-    Raises MessageError unless it is a map with string keys that has what every sample has.
+    kind: None when this process does not know the type. Then they are as msgpack has them: lists, maps, arrays; what
+    was left out because it is the default is not there.
     """
-    decode(payload, Sample)
-    try:
-        fields: dict[str, Any] = _fields.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MessageError(str(error)) from error
+    message = decode(payload, kind or Sample)
+    if kind is not None:
+        return {name: getattr(message, name) for name in message.__struct_fields__}
+    fields: dict[str, Any] = _fields.decode(payload)  # it is a map with string keys, or it would not be a sample
+    if _is_deeper(fields, MOST_LEVELS):
+        raise MessageError(f"nested more than {MOST_LEVELS} levels deep")
     return fields
+
+
+def plain(value: Any) -> Any:
+    """`value` of a field as JSON has it: an infinite value is its name, a complex one its two parts."""
+    match value:
+        case float() if not math.isfinite(value):
+            return str(value)
+        case complex():
+            return [value.real, value.imag]
+        case np.ndarray():
+            return plain(value.tolist())
+        case list() | tuple():
+            return [plain(each) for each in value]
+        case dict():
+            return {str(key): plain(each) for key, each in value.items()}
+    return msgspec.to_builtins(value)
 
 
 def require_sound(kind: type[Sample]) -> None:
@@ -119,6 +139,11 @@ def _from_ext(code: int, data: memoryview) -> arrays.Array:
     if code != arrays.EXT_TYPE:
         raise MessageError(f"msgpack ext type {code}; the wire has only {arrays.EXT_TYPE}, an array")
     return arrays.from_bytes(data)
+
+
+def _is_deeper(value: object, levels: int) -> bool:
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
+    return levels < 0 or any(_is_deeper(each, levels - 1) for each in inside)
 
 
 def _to_ext(value: object) -> msgspec.msgpack.Ext:

@@ -18,6 +18,7 @@ from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
+from caneflow.messages.codec import fields_in
 from caneflow.messages.rig import Rig, overlaid, read_rig
 from caneflow.printable import printable
 from caneflow.recording.continuity import Continuity
@@ -39,6 +40,7 @@ from caneflow.recording.writer import FORMAT_VERSION
 TRUTH = ("truth", "pose")  # node and port of the ground truth, where there is any
 MAX_RIG = 2**20  # characters of JSON
 MAX_RIG_DEPTH = 16
+MAX_SCHEMA_DEPTH = 64
 MAX_HELD = 2**26  # bytes of unpacked blocks in use at a time, one per stream; a payload that is given out adds its own
 COUNTED = (
     2**16
@@ -77,7 +79,7 @@ class Recorded(NamedTuple):
     key: str
     node: str
     port: str
-    kind: type[Sample] | None  # None: a schema that this version of caneflow does not know
+    kind: type[Sample] | None  # None: a type that this process does not know, as a user's own
     stamp: int  # ns, when the sensor measured
     seq: int
     log_time: int  # ns, when it was received
@@ -86,9 +88,16 @@ class Recorded(NamedTuple):
     def decoded(self) -> Sample:
         """The sample itself; raises RecordingError, naming stream and number, when it breaks the contract."""
         if self.kind is None:
-            raise RecordingError(f"{self.key}: holds messages that this version of caneflow does not know")
+            raise RecordingError(f"{self.key}: holds messages of a type that is not known here")
         try:
             return decode(self.payload, self.kind)
+        except MessageError as error:
+            raise RecordingError(f"{self.key}: sample {self.seq}: {error}") from error
+
+    def fields(self) -> dict[str, Any]:
+        """Its fields by name, of any type; raises RecordingError as `decoded` does for those that are known."""
+        try:
+            return fields_in(self.payload, self.kind)
         except MessageError as error:
             raise RecordingError(f"{self.key}: sample {self.seq}: {error}") from error
 
@@ -219,6 +228,15 @@ class Recording:
             return self.streams[node, port]
         except KeyError:
             raise RecordingError(f"{self.path}: no stream {node}/{port}; there are {self.named()}") from None
+
+    def json_schema(self, node: str, port: str) -> dict[str, Any]:
+        """The JSON Schema of a stream's messages as it was recorded; {} when there is none to be read."""
+        channel = self._topics()[self.stream(node, port).key]
+        try:
+            schema = json.loads(self._schema(channel).data)
+        except (ValueError, RecursionError):
+            return {}
+        return schema if isinstance(schema, dict) and not _is_deeper(schema, MAX_SCHEMA_DEPTH) else {}
 
     def named(self) -> str:
         """The names of the streams, for a line; of very many only the first."""

@@ -69,15 +69,21 @@ def kind_at(place: str) -> type[Sample]:
     """The message type at a place as `place_of` gives it; raises DataflowError when there is none."""
     where, _, name = place.rpartition(":")
     try:
-        with redirect_stdout(sys.stderr):  # what a file prints is no answer of ours
-            found: object = _member(Path(where)) if where.endswith(".py") else importlib.import_module(where)
+        found: object = _imported(Path(where)) if where.endswith(".py") else importlib.import_module(where)
         for part in name.split("."):
             found = getattr(found, part)
-    except (Exception, SystemExit) as error:  # a user's file may do anything while it is imported
+    except (ImportError, AttributeError) as error:
         raise DataflowError(f"no message type {place}: {one_line(error)}") from error
     if not (isinstance(found, type) and issubclass(found, Sample)):
         raise DataflowError(f"{place} is not a message type; expected a class derived from Sample")
     return found
+
+
+def messages_in(file: Path) -> list[type[Sample]]:
+    """The message types that the Python file at an absolute path defines or imports; raises DataflowError."""
+    found = vars(_imported(file)).values()
+    kinds = (kind for kind in found if isinstance(kind, type) and issubclass(kind, Sample) and kind.schema)
+    return list(dict.fromkeys(kinds))
 
 
 class _Fresh(SourceFileLoader):
@@ -91,6 +97,14 @@ def _fresh(name: str, file: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, file, loader=_Fresh(name, str(file)))
     assert spec is not None
     return importlib.util.module_from_spec(spec)
+
+
+def _imported(file: Path) -> ModuleType:
+    try:
+        with redirect_stdout(sys.stderr):  # what a file prints is no answer of ours
+            return _member(file)
+    except (Exception, SystemExit) as error:  # a user's file may do anything while it is imported
+        raise DataflowError(f"{file} cannot be imported: {type(error).__name__}: {one_line(error)}") from error
 
 
 def _member(file: Path) -> ModuleType:

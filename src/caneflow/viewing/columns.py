@@ -25,6 +25,11 @@ COLUMNS: Mapping[type[Sample], tuple[str, ...]] = {
 }
 
 
+def message_name(schema: str) -> str:
+    """The message's name as the page has it: `Imu` for ours, `mine.Range` for a user's own."""
+    return schema.removeprefix("caneflow.").partition("/")[0]
+
+
 def row_of(message: Sample, boresight: Vector) -> Row:
     """The numbers of `message` in the order of COLUMNS; () for kinds of which only stamps are told.
 

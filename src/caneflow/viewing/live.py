@@ -16,7 +16,7 @@ from caneflow.messages import Pose, RadarFrame, Sample
 from caneflow.messages.control import FlowStatus
 from caneflow.messages.rig import Rig
 from caneflow.viewing import packets
-from caneflow.viewing.columns import COLUMNS, Row, packed, row_of
+from caneflow.viewing.columns import COLUMNS, Row, message_name, packed, row_of
 from caneflow.viewing.radar_picture import RadarPicture, RadarWindow
 
 HISTORY = 12_000  # samples of a stream that a page is sent which opens later: two minutes at 100 Hz
@@ -36,6 +36,7 @@ class _Stream:
     """What is known of one stream."""
 
     kind: type[Sample]
+    named: str  # the message's name, e.g. Imu
     rows: deque[tuple[float, Row]] = field(default_factory=lambda: deque(maxlen=HISTORY))  # s since the origin
     pending: deque[tuple[float, Row]] = field(default_factory=lambda: deque(maxlen=MOST_PENDING))
     first_seq: int = 0  # of what is pending
@@ -71,8 +72,11 @@ class LiveStreams:
         self._unheard = 0
         self._ended = False
 
-    def take(self, name: str, message: Sample, received: int) -> None:
-        """Take a sample of the stream `name` (node/port), received at `received` ns."""
+    def take(self, name: str, message: Sample, received: int, schema: str = "") -> None:
+        """Take a sample of the stream `name` (node/port), received at `received` ns.
+
+        schema: of a message whose type is not known here, so that it is a bare Sample.
+        """
         if self._live and message.stamp - received > FAR_AHEAD_NS:
             return  # it would be drawn where nothing else comes for ever; its number counts as missing
         row = row_of(message, self._boresight)
@@ -83,7 +87,9 @@ class LiveStreams:
                     self._live = abs(received - message.stamp) < STALE_CLOCK_NS
             stream = self._streams.get(name)
             if stream is None:
-                stream = self._streams[name] = _Stream(type(message), last_seq=message.seq - 1)
+                stream = self._streams[name] = _Stream(
+                    type(message), message_name(message.schema or schema), last_seq=message.seq - 1
+                )
             self._note_number(stream, message.seq)
             stream.left_out += len(stream.pending) == MOST_PENDING
             if not stream.pending:
@@ -176,7 +182,7 @@ class LiveStreams:
 
 def _packed(stream: _Stream, rows: list[tuple[float, Row]], first_seq: int) -> Any:
     return packets.stream(
-        kind=stream.kind.__name__,
+        kind=stream.named,
         columns=COLUMNS.get(stream.kind, ()),
         times=packed([(time_s,) for time_s, _ in rows]),
         rows=packed([row for _, row in rows]),
@@ -191,7 +197,7 @@ def _traffic(stream: _Stream, now: float) -> dict[str, Any]:
     recent = list(takewhile(lambda arrival: now - arrival[0] <= RATE_SPAN, reversed(stream.arrivals)))
     ages = sorted(age for _, age in recent if not math.isnan(age))
     return {
-        "type": stream.kind.__name__,
+        "type": stream.named,
         "count": stream.count,
         "rate": len(recent) / RATE_SPAN,
         "silent": now - stream.arrivals[-1][0] if stream.arrivals else None,

@@ -12,7 +12,7 @@ from caneflow.algorithms.rotations import Vector
 from caneflow.messages import Pose, RadarFrame
 from caneflow.recording import TRUTH, Recorded, Recording, RecordingError, Stream
 from caneflow.viewing import packets
-from caneflow.viewing.columns import COLUMNS, Row, packed, row_of
+from caneflow.viewing.columns import COLUMNS, Row, message_name, packed, row_of
 from caneflow.viewing.radar_picture import SCANS, RadarWindow
 
 MOST_POINTS = 20_000  # of a stream; of a longer one every so many samples are shown
@@ -129,8 +129,7 @@ class RecordedStreams:
         return window.picture()
 
     def _read(self, recording: Recording, name: str, stream: Stream) -> None:
-        kind = stream.schema.removeprefix("caneflow.").partition("/")[0]
-        part = _Part(kind=kind, every=max(1, -(-stream.count // MOST_POINTS)), of=stream.count)
+        part = _Part(kind=message_name(stream.schema), every=max(1, -(-stream.count // MOST_POINTS)), of=stream.count)
         for number, sample in enumerate(recording.samples([(stream.node, stream.port)])):
             part.count(sample.seq)
             if number % part.every == 0:
