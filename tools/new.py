@@ -69,24 +69,17 @@ import numpy as np
 import pytest
 
 from caneflow.messages import Imu
-from caneflow.messages.rig import read_rig
-from caneflow.runtime import Context
+from caneflow.testing import run_operator
 
 from NAME import CLASS, CLASSSettings
 
 STEP = 10_000_000  # ns: 100 Hz
 
 
-def operator(time_constant: float) -> CLASS:
-    context = Context(node="NAME", rig=read_rig({}), ports={"imu": Imu}, random=np.random.default_rng(0))
-    return CLASS(CLASSSettings(time_constant=time_constant), context)
-
-
 def test_a_step_is_reached_to_63_percent_after_the_time_constant() -> None:
-    smooth = operator(time_constant=0.1)
     turning = [Imu(stamp=seq * STEP, gyro=(0.0, 0.0, float(seq > 0))) for seq in range(11)]
 
-    out = [message for sample in turning for _, message in smooth.handle("imu", sample)]
+    out = run_operator(CLASS, {"imu": turning}, settings=CLASSSettings(time_constant=0.1))["imu"]
 
     assert [message.stamp for message in out] == [sample.stamp for sample in turning]
     assert isinstance(out[-1], Imu)

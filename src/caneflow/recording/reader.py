@@ -7,6 +7,8 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from itertools import islice, takewhile
 from operator import attrgetter
 from pathlib import Path
@@ -14,13 +16,16 @@ from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple, Self, TypeAlias
 from weakref import WeakValueDictionary
 
+import numpy as np
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
+from numpy.typing import NDArray
 
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.codec import fields_in
 from caneflow.messages.rig import Rig, overlaid, read_rig
 from caneflow.printable import printable
+from caneflow.recording.columns import flat, structured
 from caneflow.recording.continuity import Continuity
 from caneflow.recording.errors import RecordingError
 from caneflow.recording.layout import (
@@ -36,6 +41,8 @@ from caneflow.recording.layout import (
 )
 from caneflow.recording.platform import Platform
 from caneflow.recording.writer import FORMAT_VERSION
+
+DataFrame: TypeAlias = Any  # of polars or pandas, neither of which is needed here
 
 TRUTH = ("truth", "pose")  # node and port of the ground truth, where there is any
 MAX_RIG = 2**20  # characters of JSON
@@ -184,6 +191,38 @@ class Recording:
         if len(each) == 1:
             return each[0]
         return heapq.merge(*each, key=attrgetter("stamp"))  # equal stamps: in the order of the arguments
+
+    def array(
+        self, stream: str | tuple[str, str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> NDArray[np.void]:
+        """The samples of `stream` ("imu/imu") with start_ns <= stamp < end_ns, one row each, a column per field.
+
+        A structured numpy array: `rows["stamp"]` (int64, ns), `rows["gyro"]` (n, 3), `rows["scans"]` (n, bins) for
+        frames of one scan, else (n, scans, bins). What a sample lacks is NaN, a field that none has is left out.
+
+        Raises RecordingError also when arrays change their shape: take a part by stamps, or `samples`.
+        """
+        node, _, port = stream.partition("/") if isinstance(stream, str) else (stream[0], "", stream[1])
+        samples = [each.decoded() for each in self.samples([(node, port)], start_ns=start_ns, end_ns=end_ns)]
+        try:
+            return structured(samples)
+        except ValueError as error:
+            raise RecordingError(f"{self.path}: {node}/{port}: {error}") from error
+
+    def frame(
+        self, stream: str | tuple[str, str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> "DataFrame":
+        """The same as a data frame of polars or, where that is not installed, of pandas.
+
+        A vector is a column per element (`gyro_0`, `gyro_1`, `gyro_2`); arrays such as scans are left out.
+
+        Raises RecordingError also where neither polars nor pandas is installed.
+        """
+        columns = flat(self.array(stream, start_ns=start_ns, end_ns=end_ns))
+        for library in ("polars", "pandas"):
+            if find_spec(library) is not None:
+                return import_module(library).DataFrame(columns)
+        raise RecordingError("a data frame takes polars or pandas: pip install polars")
 
     def examined(
         self,
