@@ -129,4 +129,4 @@ def _losses(parsed: Log) -> str:
     return ", ".join(parts)
 
 
-commands = {"p440": p440, "imu-csv": "import_imu_csv", "wav": "import_wav"}
+commands = {"p440": p440, "imu-csv": "import_imu_csv", "wav": "import_wav", "rosbag": "import_rosbag"}
