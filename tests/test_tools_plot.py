@@ -1,16 +1,19 @@
 """`caneflow plot`: a picture of whatever there is; the errors it prints are those of the evaluation."""
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from caneflow import command
 from caneflow.algorithms.judging.track_errors import track_errors
-from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
+from caneflow.messages import DopplerBlock, GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
 from caneflow.recording import RecordingWriter
+from caneflow.viewing.sensor_pictures import euler_angles
 from tools.plot import read_picture, summary
 
 Run = tuple[int, str, str]  # exit status, standard output, standard error
@@ -126,10 +129,11 @@ def test_a_run_over_a_part_of_the_walk_is_compared_with_that_part(tmp_path: Path
 
 def test_doppler_shows_what_approaches_above_zero(tmp_path: Path) -> None:
     picture = read_picture(write(tmp_path / "track.mcap", [*walk(3, 0.2), *radar(300, 0.4)]))
-    assert picture.doppler is not None
-    times, radial_speeds, power = picture.doppler
-    assert power.shape == (len(radial_speeds), len(times))
-    assert radial_speeds[power.argmax(axis=0)] == pytest.approx(0.4, abs=radial_speeds[1] - radial_speeds[0])
+    drawn = picture.radar
+    assert drawn is not None
+    assert drawn.speed_time.shape == (len(drawn.speeds), len(drawn.times))
+    found = drawn.speeds[drawn.speed_time.argmax(axis=0)]
+    assert found == pytest.approx(0.4, abs=drawn.speeds[1] - drawn.speeds[0])
 
 
 def test_in_a_room_positions_are_absolute(tmp_path: Path) -> None:
@@ -151,12 +155,82 @@ def test_truth_alone_and_a_track_alone_are_drawn(caneflow: Callable[..., Run], t
     assert out == ("" if kept == "truth" else "fusion/pose kalman: 100 poses; no ground truth to compare with\n")
 
 
-def test_a_recording_without_poses_says_so(caneflow: Callable[..., Run], tmp_path: Path) -> None:
-    path = write(tmp_path / "walk.mcap", [("cane/imu/imu", Imu(stamp=i, gyro=(0, 0, 0))) for i in range(10)])
+def test_a_radar_alone_is_drawn_over_range_time_and_speed(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    path = write(tmp_path / "radar.mcap", radar(300, 0.4))
+    status, out, err = caneflow("plot", path, "-o", tmp_path / "radar.png")
+    assert (status, out, err) == (0, "radar: 0.3 to 0.3 m, +-1.74 m/s\n", "")
+    assert (tmp_path / "radar.png").stat().st_size > 10_000
+    drawn = read_picture(path).radar
+    assert drawn is not None
+    speed, place = np.unravel_index(drawn.range_speed.argmax(), drawn.range_speed.shape)
+    assert drawn.ranges[place] == pytest.approx(0.309)  # the second range bin is the one that moves
+    assert drawn.speeds[speed] == pytest.approx(0.4, abs=drawn.speeds[1] - drawn.speeds[0])
+    assert drawn.range_time.argmax(axis=0).tolist() == [1] * len(drawn.times)
+
+
+def module(seconds: float, speed: float) -> list[tuple[str, Sample]]:
+    """A Doppler module at 24.125 GHz that hears a walker of constant speed in white noise."""
+    rate, carrier = 4000, 24.125e9
+    time = np.arange(int(seconds * rate)) / rate
+    noise = 1e-3 * np.random.default_rng(2).standard_normal(len(time))
+    sound = 0.05 * np.sin(2 * np.pi * 2 * speed * carrier / 299_792_458 * time) * (time > 2.0) + noise
+    blocks = np.float32(sound).reshape(-1, 200)
+    return [
+        (
+            "room/south/block",
+            DopplerBlock(stamp=(i + 1) * 50_000_000, samples=block, sample_rate=float(rate), carrier=carrier),
+        )
+        for i, block in enumerate(blocks)
+    ]
+
+
+def test_a_doppler_module_alone_is_drawn_with_its_line(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    path = write(tmp_path / "sound.mcap", module(5.0, 1.2))
+    status, out, err = caneflow("plot", path, "-o", tmp_path / "sound.png")
+    assert (status, err) == (0, "")
+    assert re.fullmatch(r"south/block: a line in \d+ of 95 spectra, median 1\.20 m/s\n", out)
+    assert (tmp_path / "sound.png").stat().st_size > 10_000
+    drawn = read_picture(path).modules["south/block"]
+    walking = drawn.times > 2.5
+    found = drawn.speeds[drawn.power.argmax(axis=0)]
+    assert found[walking] == pytest.approx(1.2, abs=2 * (drawn.speeds[1] - drawn.speeds[0]))
+    assert drawn.line[walking] == pytest.approx(1.2, abs=0.01)
+    assert drawn.power[:, drawn.times < 1.5].max() < 20.0 < drawn.power[:, walking].max()
+
+
+def test_an_imu_alone_is_drawn_with_its_attitude(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    """It rolls at 0.5 rad/s, gravity with it: 57.3 degrees after 2 s."""
+    angles = 0.5 * np.arange(201) / 100
+    samples = [
+        (
+            "cane/imu/imu",
+            Imu(stamp=PERIOD * i, gyro=(0.5, 0, 0), accel=(0.0, 9.81 * float(np.sin(a)), 9.81 * float(np.cos(a)))),
+        )
+        for i, a in enumerate(angles)
+    ]
+    path = write(tmp_path / "imu.mcap", list(samples))
+    status, out, err = caneflow("plot", path, "-o", tmp_path / "imu.png")
+    assert (status, out, err) == (0, "imu: 201 samples, 100.0 Hz; attitude filter, yaw from 0\n", "")
+    assert (tmp_path / "imu.png").stat().st_size > 10_000
+    drawn = read_picture(path).imu
+    assert drawn is not None
+    assert drawn.attitude is not None
+    assert drawn.attitude[-1] == pytest.approx((np.degrees(1.0), 0.0, 0.0), abs=1.0)
+
+
+def test_angles_are_those_of_the_rotations_about_z_y_x() -> None:
+    expected = np.array([[10.0, -20.0, 170.0], [12.0, -25.0, 190.0], [-30.0, 40.0, 200.0]])
+    turned = Rotation.from_euler("ZYX", expected[:, ::-1], degrees=True).as_quat(scalar_first=True)
+    assert euler_angles(turned) == pytest.approx(expected)
+
+
+def test_a_recording_with_nothing_to_draw_says_so(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    path = write(tmp_path / "walk.mcap", [("cane/imu/imu", Imu(stamp=0, gyro=(0, 0, 0)))])
     status, _, err = caneflow("plot", path, "-o", tmp_path / "walk.png")
     assert status == 2
-    assert err.startswith(f"caneflow plot: {path}: no track to draw, there are no poses in it; `caneflow run")
-    assert err.count("\n") == 1
+    assert err == (
+        f"caneflow plot: {path}: nothing to draw: no poses, speeds, radar frames, Doppler blocks or IMU samples\n"
+    )
 
 
 def test_another_kind_of_picture_is_refused_before_the_work(caneflow: Callable[..., Run], tmp_path: Path) -> None:

@@ -1,25 +1,31 @@
-"""`caneflow plot`: a recording as a picture: where one was, how fast, how far from the truth."""
+"""`caneflow plot`: a recording as a picture: the track, its speed and errors, or what a single sensor shows."""
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Annotated, TypeAlias, cast
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
 from caneflow.algorithms.judging.track_errors import START_NS, Track, boresight_yaws, track_errors
-from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
-from caneflow.algorithms.radar.range_doppler import hann, range_doppler_map, speed_limit
 from caneflow.algorithms.rotations import Vector
 from caneflow.errors import CaneflowError
-from caneflow.messages import GroundSpeed, Pose, RadarFrame
+from caneflow.messages import DopplerBlock, GroundSpeed, Imu, Pose, RadarFrame
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
 from caneflow.printable import printable
 from caneflow.recording import TRUTH, Recording, RecordingError, Stream
+from caneflow.viewing.sensor_pictures import (
+    DopplerPicture,
+    ImuPicture,
+    RadarPictures,
+    doppler_picture,
+    imu_picture,
+    radar_pictures,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,6 +36,7 @@ Panel: TypeAlias = Callable[["Axes"], None]
 
 SUFFIXES = (".png", ".svg", ".pdf")
 INK, FAINT = "#333333", "#b0b0b0"
+BRIGHT = "#40ffd0"  # on a dark picture
 COLOURS = (
     "#0072b2",
     "#d55e00",
@@ -41,10 +48,9 @@ UNOBSERVED = 1e5  # m^2/s^2: a velocity with this variance was not measured (wir
 
 MOST_TRACKS = 20  # more cannot be told apart
 
-SLOW_TIME = 64  # scans of one spectrum: 0.64 s of a cane
-SPECTRUM = 256  # lines of one spectrum
-MOST_COLUMNS = 800  # spectra side by side: more than there are pixels
+MOST_MODULES = 4  # Doppler modules below each other
 DYNAMIC_RANGE = 35.0  # dB
+DOPPLER = "Doppler, m/s (approaching)"
 
 
 @dataclass
@@ -59,7 +65,9 @@ class Picture:
     truth: Track | None = None
     truth_speed: Floats | None = None  # (n,) m/s, along the boresight's projection; a room has no boresight
     speeds: dict[str, Floats] = field(default_factory=dict)  # by node/port: (n, 3) of time, speed, quality
-    doppler: tuple[Floats, Floats, Floats] | None = None  # times (n,), radial speeds (m,), power (m, n) in dB
+    radar: RadarPictures | None = None
+    modules: dict[str, DopplerPicture] = field(default_factory=dict)  # by node/port
+    imu: ImuPicture | None = None  # only where nothing else is
 
     def seconds(self, track: Track) -> Floats:
         """Times (s) of a track's poses."""
@@ -100,6 +108,9 @@ def command(
 ) -> None:
     """Draw a recording's track against the truth, its speed, its error over time and the radar's Doppler.
 
+    Of a recording without positions it draws what its sensors show: a radar's ranges and speeds over time, a Doppler
+    module's spectrum with the line in it, an IMU's readings with the attitude.
+
     A track is laid on the truth at its start, by position and yaw only, and its errors are printed: the last one,
     the root mean square (ATE), and the paper's distance from end to start. A picture of the same format is replaced;
     any other file only with --overwrite.
@@ -112,8 +123,23 @@ def command(
     with whole(output, inputs=[recording], overwrite=overwrite, picture=form) as path:
         picture = read_picture(recording)
         draw(picture).savefig(path, dpi=150, format=form)
-    for line in summary(picture):
+    for line in (*summary(picture), *shown(picture)):
         print(line)
+
+
+def shown(picture: Picture) -> Iterator[str]:
+    """A line per sensor that is drawn because there are no positions."""
+    if picture.tracks or picture.truth:
+        return
+    if radar := picture.radar:
+        yield f"radar: {radar.ranges[0]:.1f} to {radar.ranges[-1]:.1f} m, +-{-radar.speeds[0]:.2f} m/s"
+    for name, module in picture.modules.items():
+        known = module.line[np.isfinite(module.line)]
+        speeds = f", median {np.median(np.abs(known)):.2f} m/s" if len(known) else ""
+        yield f"{name}: a line in {len(known)} of {len(module.line)} spectra{speeds}"
+    if imu := picture.imu:
+        rate = (len(imu.times) - 1) / (imu.times[-1] - imu.times[0])
+        yield f"imu: {len(imu.times)} samples, {rate:.1f} Hz" + (f"; {imu.source}" if imu.attitude is not None else "")
 
 
 def summary(picture: Picture) -> Iterator[str]:
@@ -139,17 +165,14 @@ def _errors_of_a_walk(track: Track, truth: Track, picture: Picture) -> str:
 
 
 def read_picture(path: Path) -> Picture:
-    """What there is to draw in the recording at `path`; raises RecordingError when nobody's position is in it."""
+    """What there is to draw in the recording at `path`; raises RecordingError when there is nothing."""
     with Recording(path) as recording:
         poses = [stream for stream in recording.streams_of(Pose) if stream.count > 1][:MOST_TRACKS]
         truth = recording.streams.get(TRUTH)
         truth = truth if truth and truth.count > 1 else None
         span = recording.span()
-        if span is None or not (poses or truth):
-            raise RecordingError(
-                f"{path}: no track to draw, there are no poses in it; "
-                f"`caneflow run dataflow.yaml --replay {path} --record track.mcap` makes some"
-            )
+        if span is None:
+            raise RecordingError(f"{path}: nothing to draw, it holds no sample")
         rig = recording.validated_rig()
         picture = Picture(
             title=f"{printable(path.name)}   {recording.flow}, {recording.metadata.get('source', '')}",
@@ -166,8 +189,33 @@ def read_picture(path: Path) -> Picture:
         for stream in recording.streams_of(GroundSpeed)[:MOST_TRACKS]:
             picture.speeds[f"{stream.node}/{stream.port}"] = _speeds(recording, stream, span[0])
         for stream in recording.streams_of(RadarFrame)[:1]:
-            picture.doppler = _doppler(recording, stream, span[0])
+            picture.radar = _radar(recording, stream, span[0])
+        if not (poses or truth):
+            _add_single_sensors(picture, recording)
+    if not (poses or truth or picture.radar or picture.modules or picture.imu or picture.speeds):
+        raise RecordingError(f"{path}: nothing to draw: no poses, speeds, radar frames, Doppler blocks or IMU samples")
     return picture
+
+
+def _add_single_sensors(picture: Picture, recording: Recording) -> None:
+    """What Doppler modules and an IMU show, where no position is known."""
+    for stream in recording.streams_of(DopplerBlock)[:MOST_MODULES]:
+        blocks = [cast(DopplerBlock, sample.decoded()) for sample in recording.samples([(stream.node, stream.port)])]
+        if module := doppler_picture(blocks, origin=picture.origin):
+            picture.modules[f"{stream.node}/{stream.port}"] = module
+    for stream in recording.streams_of(Imu)[:1]:
+        samples = [cast(Imu, sample.decoded()) for sample in recording.samples([(stream.node, stream.port)])]
+        picture.imu = imu_picture(samples, origin=picture.origin)
+
+
+def _radar(recording: Recording, stream: Stream, origin: int) -> RadarPictures | None:
+    """The pictures of a radar; None for too few scans, or a pulse that they cannot hold."""
+    keys = [(stream.node, stream.port)]
+    first = next((cast(RadarFrame, sample.decoded()) for sample in recording.samples(keys)), None)
+    if first is None:
+        return None
+    frames = (cast(RadarFrame, sample.decoded()) for sample in recording.samples(keys))
+    return radar_pictures(frames, scans=stream.count * len(first.scans), origin=origin)
 
 
 def _track(recording: Recording, stream: Stream) -> tuple[Track, Floats, str]:
@@ -199,42 +247,6 @@ def _speeds(recording: Recording, stream: Stream, origin: int) -> Floats:
     return np.array(rows, dtype=np.float64)
 
 
-def _doppler(recording: Recording, stream: Stream, origin: int) -> tuple[Floats, Floats, Floats] | None:
-    """Power over radial speed and time, all ranges together, without what stands still; None for too few scans."""
-    window: deque[NDArray[Any]] = deque(maxlen=SLOW_TIME)
-    times: list[float] = []
-    columns: list[Floats] = []
-    period, carrier = 0.0, 0.0
-    every = max(SLOW_TIME // 8, stream.count // MOST_COLUMNS)
-    for number, sample in enumerate(recording.samples([(stream.node, stream.port)])):
-        frame = cast(RadarFrame, sample.decoded())
-        if window and window[-1].shape != frame.scans[-1].shape:
-            window.clear()
-        window.extend(frame.scans)
-        if number % every == 0 and len(window) == SLOW_TIME:
-            times.append((frame.stamp - origin) * 1e-9 - 0.5 * SLOW_TIME * frame.scan_period)
-            columns.append(_spectrum(np.array(window), frame))
-            period, carrier = frame.scan_period, frame.carrier
-    if not columns:
-        return None
-    limit = speed_limit(scan_period=period, carrier=carrier)
-    power = 10.0 * np.log10(np.stack(columns, axis=1) + 1e-12)
-    return np.array(times), np.linspace(-limit, limit, SPECTRUM, endpoint=False), power
-
-
-def _spectrum(scans: NDArray[Any], frame: RadarFrame) -> Floats:
-    """Power of `scans` (n, bins) over radial speed, shape (SPECTRUM,), from the lowest to the highest."""
-    if not np.iscomplexobj(scans):
-        signal = AnalyticSignal(
-            bins=scans.shape[1], range_step=frame.range_step, carrier=frame.carrier, bandwidth=frame.bandwidth
-        )
-        scans = signal(scans)
-    moving = (scans - scans.mean(axis=0)).T.astype(np.complex64)
-    power = np.abs(range_doppler_map(moving, hann(len(scans)), SPECTRUM)) ** 2
-    summed: Floats = np.fft.fftshift(power.sum(axis=0)).astype(np.float64)
-    return summed
-
-
 def draw(picture: Picture) -> "Figure":
     """The figure: the track on the left, time series on the right, as many as there are data for."""
     try:
@@ -247,8 +259,11 @@ def draw(picture: Picture) -> "Figure":
     panels = list(_panels(picture))
     figure = Figure(figsize=(14, 7.5), layout="constrained", facecolor="white")
     figure.suptitle(picture.title, x=0.01, ha="left", color=INK, fontsize=12)
-    grid = figure.add_gridspec(max(len(panels), 1), 2, width_ratios=(1.1, 1 if panels else 1e-3))
-    _draw_track(figure.add_subplot(grid[:, 0]), picture)
+    aside = _aside(picture)
+    widths = (1.1 if aside else 1e-3, 1 if panels else 1e-3)
+    grid = figure.add_gridspec(max(len(panels), 1), 2, width_ratios=widths)
+    if aside:
+        aside(figure.add_subplot(grid[:, 0]))
     first = None
     for row, panel in enumerate(panels):
         axes = figure.add_subplot(grid[row, 1], sharex=first)
@@ -261,13 +276,33 @@ def draw(picture: Picture) -> "Figure":
     return figure
 
 
+def _aside(picture: Picture) -> Panel | None:
+    """What stands on the left, without time: the track, else a radar's map."""
+    if picture.tracks or picture.truth is not None:
+        return lambda axes: _draw_track(axes, picture)
+    if (radar := picture.radar) is not None:
+        return lambda axes: _draw_range_speed(axes, radar)
+    return None
+
+
 def _panels(picture: Picture) -> Iterator[Panel]:
     if picture.speeds or picture.truth_speed is not None:
         yield lambda axes: _draw_speeds(axes, picture)
     if picture.truth is not None and picture.tracks:
         yield lambda axes: _draw_errors(axes, picture)
-    if picture.doppler is not None:
-        yield lambda axes: _draw_doppler(axes, picture)
+    if (radar := picture.radar) is not None:
+        if not (picture.tracks or picture.truth):
+            yield lambda axes: _draw_power(axes, radar.times, radar.ranges, radar.range_time, "range, m")
+        yield lambda axes: _draw_power(axes, radar.times, radar.speeds, radar.speed_time, DOPPLER)
+    for name, module in picture.modules.items():
+        yield partial(_draw_module, name=name, module=module)
+    if (imu := picture.imu) is not None:
+        yield lambda axes: _draw_vectors(axes, imu.times, np.degrees(imu.gyro), "gyro, deg/s", "xyz")
+        if (accel := imu.accel) is not None:
+            yield lambda axes: _draw_vectors(axes, imu.times, accel, "accel, m/s\N{SUPERSCRIPT TWO}", "xyz")
+        if (attitude := imu.attitude) is not None:
+            label = f"attitude, deg\n{imu.source}"
+            yield lambda axes: _draw_vectors(axes, imu.times, attitude, label, ("roll", "pitch", "yaw"))
 
 
 def _draw_track(axes: "Axes", picture: Picture) -> None:
@@ -321,13 +356,45 @@ def _draw_errors(axes: "Axes", picture: Picture) -> None:
     axes.grid(color="#eeeeee")
 
 
-def _draw_doppler(axes: "Axes", picture: Picture) -> None:
-    assert picture.doppler is not None
-    times, speeds, power = picture.doppler
-    relative = power - np.percentile(power, 99.8)  # the very loudest lines are few
-    mesh = axes.pcolormesh(times, speeds, relative, cmap="magma", vmin=-DYNAMIC_RANGE, vmax=0, rasterized=True)
-    axes.set_ylabel("Doppler, m/s (approaching)")
+def _draw_power(axes: "Axes", x: Floats, y: Floats, power: Floats, label: str) -> None:
+    """Power (y, x) in dB below its strongest, of which the very loudest few are left out."""
+    relative = power - np.percentile(power, 99.8)
+    mesh = axes.pcolormesh(x, y, relative, cmap="magma", vmin=-DYNAMIC_RANGE, vmax=0, rasterized=True)
+    axes.set_ylabel(label)
     axes.figure.colorbar(mesh, ax=axes, label="dB", pad=0.01)
+
+
+def _draw_range_speed(axes: "Axes", radar: RadarPictures) -> None:
+    _draw_power(axes, radar.ranges, radar.speeds, radar.range_speed, DOPPLER)
+    axes.set_xlabel("range, m")
+    axes.set_title("what moves, over the whole recording", loc="left", fontsize=10, color=INK)
+    _plain(axes)
+
+
+def _draw_module(axes: "Axes", *, name: str, module: DopplerPicture) -> None:
+    mesh = axes.pcolormesh(
+        module.times, module.speeds, module.power, cmap="magma", vmin=0, vmax=DYNAMIC_RANGE + 5.0, rasterized=True
+    )
+    axes.plot(module.times, module.line, ".", color=BRIGHT, markersize=4, label=module.source)
+    axes.set_ylabel(f"{name}\n{'away' if module.signed else 'speed'}, m/s")
+    axes.legend(loc="upper right", frameon=False, fontsize=9, labelcolor="white")
+    axes.figure.colorbar(mesh, ax=axes, label="dB over the median", pad=0.01)
+
+
+def _draw_vectors(axes: "Axes", times: Floats, vectors: Floats, label: str, names: Sequence[str]) -> None:
+    for vector, name, colour in zip(vectors.T, names, COLOURS, strict=False):
+        axes.plot(times, vector, color=colour, linewidth=0.8, label=name)
+    axes.set_ylabel(label)
+    axes.grid(color="#eeeeee")
+    axes.legend(
+        loc="lower right",  # of the legend, at the axes' upper right: above, where nothing is drawn
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.0,
+        frameon=False,
+        ncols=3,
+        fontsize=9,
+        labelcolor=INK,
+    )
 
 
 def _plain(axes: "Axes") -> None:
