@@ -3,17 +3,21 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, TypeAlias
 
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from caneflow.messages import DopplerBlock, Imu, Pose, RadarFrame, Sample, numbered, sample_key
+from caneflow.messages import DopplerBlock, Imu, Pose, RadarFrame, Ranges, Sample, numbered, sample_key
 from caneflow.options import Overwrite
 from caneflow.outputs import made_folder, require_free, whole
 from caneflow.recording import TRUTH, RecordingWriter
 from caneflow.simulation.doppler_module import Kind
+from caneflow.simulation.guided_walk import RANGERS, GuidedWalk, simulate_guided_walk
+from caneflow.simulation.obstacle_course import SceneKind, ThingKind
+from caneflow.simulation.ranger import Readings
 from caneflow.simulation.room_cane import CaneInRoom, simulate_cane_in_room
 from caneflow.simulation.room_course import RoomShape
 from caneflow.simulation.room_scenario import PARTS, SENSORS, Part, RoomRecording, World, room_settings, simulate_room
@@ -28,7 +32,13 @@ Samples: TypeAlias = Iterator[tuple[tuple[str, str], int, Sample]]  # node and p
 
 def walk(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="REC", help="Recording to write.")],
-    scenario: Annotated[str, typer.Option(metavar="NAME", help=f"One of {', '.join(SCENARIOS)}.")] = "swing",
+    scenario: Annotated[
+        str | None, typer.Option(metavar="NAME", help=f"One of {', '.join(SCENARIOS)}; by default swing.")
+    ] = None,
+    scene: Annotated[
+        SceneKind | None, typer.Option(help="Instead of a scenario: a place with things in the way, and range sensors.")
+    ] = None,
+    thing: Annotated[ThingKind | None, typer.Option(help="What the scene `approach` ends at.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of all random numbers: the same seed is the same walk.")] = 1,
     duration: Annotated[
         float | None,
@@ -38,8 +48,20 @@ def walk(
 ) -> None:
     """Simulate a walk with a white cane: IMU and radar at 100 Hz, and where the cane truly was.
 
+    With --scene also two range sensors at 15 Hz, and where everything stands (metadata record `scene`).
+
     Example: caneflow simulate walk --scenario stops --seed 3 -o stops_3.mcap
+
+    Example: caneflow simulate walk --scene approach --thing pole --seed 3 -o pole_3.mcap
     """
+    if scene is not None:
+        if scenario is not None:
+            raise typer.BadParameter("a scene has a walk of its own; use one of the two", param_hint="--scenario")
+        guided_walk(output, scene, thing, seed, duration, overwrite=overwrite)
+        return
+    if thing is not None:
+        raise typer.BadParameter("goes with --scene approach", param_hint="--thing")
+    scenario = scenario or "swing"
     if scenario not in SCENARIOS:
         raise typer.BadParameter(f"no walk {scenario!r}; there are {', '.join(SCENARIOS)}", param_hint="--scenario")
     with whole(output, overwrite=overwrite) as recording:
@@ -48,6 +70,23 @@ def walk(
         written(recording, CANE, walked.rig, samples_of(walked))
     seconds = float(walked.stamps_ns[-1] - walked.stamps_ns[0]) / 1e9
     print(f"{output}: {scenario}, seed {seed}: {len(walked.stamps_ns)} samples a stream, {seconds:.2f} s")
+
+
+def guided_walk(
+    output: Path, scene: SceneKind, thing: ThingKind | None, seed: int, duration: float | None, *, overwrite: bool
+) -> None:
+    """Write a walk through a scene."""
+    if (thing is None) == (scene == "approach"):
+        said = "--scene approach needs one" if thing is None else f"a {scene} has things of its own"
+        raise typer.BadParameter(f"{said}; pole, box, table, sign, person or stairs", param_hint="--thing")
+    with whole(output, overwrite=overwrite) as recording:
+        with progress_bar(f"{scene}, seed {seed}") as progress:
+            walked = simulate_guided_walk(scene, seed, thing, duration, progress)
+        records = {"scene": walked.scene}
+        written(recording, CANE, walked.walk.rig, guided_samples(walked), records)
+    seconds = float(walked.walk.stamps_ns[-1] - walked.walk.stamps_ns[0]) / 1e9
+    samples = len(walked.walk.stamps_ns)
+    print(f"{output}: {walked.scene['kind']}, seed {seed}: {samples} samples a stream, {seconds:.2f} s")
 
 
 def room(
@@ -126,9 +165,15 @@ def room_names(output: Path, name: str, part: Literal[Part, "all"]) -> dict[Part
     return paths if part == "all" else {part: paths[part]}
 
 
-def written(output: Path, flow: str, rig: Mapping[str, object], samples: Samples) -> None:
-    """Write a recording of samples that come in the order of their stamps."""
-    with RecordingWriter(output, flow=flow, source="simulated", rig=dict(rig)) as writer:
+def written(
+    output: Path,
+    flow: str,
+    rig: Mapping[str, object],
+    samples: Samples,
+    records: Mapping[str, object] = MappingProxyType({}),
+) -> None:
+    """Write a recording of samples that come in the order of their stamps, with more metadata `records` by name."""
+    with RecordingWriter(output, flow=flow, source="simulated", rig=dict(rig), records=records) as writer:
         for name, seq, sample in samples:
             payload, stamp = numbered(sample, seq), sample.stamp
             writer.write(sample_key(flow, *name), type(sample), payload, stamp=stamp, seq=seq, log_time=stamp)
@@ -139,6 +184,32 @@ def samples_of(walked: Walk) -> Samples:
     for i in range(len(walked.stamps_ns)):
         yield from cane_samples(walked, i)
         yield TRUTH, i, true_pose(walked, i)
+
+
+def guided_samples(walked: GuidedWalk) -> Samples:
+    """What the cane and its range sensors say, and the truth, in the order of the stamps."""
+    begin, readings = int(walked.walk.stamps_ns[0]), walked.readings
+    due = sorted((begin + round(t * 1e9), name, i) for name, each in readings.items() for i, t in enumerate(each.time))
+    for i, stamp in enumerate(walked.walk.stamps_ns.tolist()):
+        while due and due[0][0] < stamp:
+            yield _reading(readings, *due.pop(0))
+        yield from cane_samples(walked.walk, i)
+        yield TRUTH, i, true_pose(walked.walk, i)
+    for each in due:
+        yield _reading(readings, *each)
+
+
+def _reading(readings: Mapping[str, Readings], stamp: int, name: str, i: int) -> tuple[tuple[str, str], int, Sample]:
+    each, period = readings[name], RANGERS[name].period
+    reading = Ranges(
+        stamp=stamp,
+        ranges=each.ranges[i],
+        status=each.status[i],
+        sigma=each.sigma[i],
+        exposure=period,
+        delay=0.5 * period,
+    )
+    return (name, "ranges"), i, reading
 
 
 def cane_samples(walked: Walk, i: int) -> Samples:

@@ -4,10 +4,10 @@ import errno
 import json
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Literal, Self, TypeAlias
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
@@ -23,6 +23,7 @@ Compression: TypeAlias = Literal["zstd", "lz4", "none"]
 Origin: TypeAlias = Literal["live", "replayed", "simulated", "imported"]
 
 FORMAT_VERSION = "1"  # of the layout of a recording; the program's own version is in the file's header
+NOTHING_MORE: Mapping[str, object] = MappingProxyType({})
 FLUSH_INTERVAL = 1_000_000_000  # ns of log time: what a killed recorder may lose
 # A second of the cane is 0.2 MB, so most chunks end with a flush; a burst ends here, for the reader's memory.
 CHUNK_SIZE = 256 * 1024  # bytes before compression
@@ -50,8 +51,12 @@ class RecordingWriter:
         compression: Compression = "zstd",
         part: int | None = None,
         new: bool = False,
+        records: Mapping[str, object] = NOTHING_MORE,
     ) -> None:
-        """`part`: which of the files of one run this is. `new`: raise FileExistsError where there is a file."""
+        """`part`: which of the files of one run this is. `new`: raise FileExistsError where there is a file.
+
+        `records`: more metadata records by name, each written as JSON, e.g. what a simulator knows of its scene.
+        """
         about = {"flow": flow, "version": FORMAT_VERSION, "run": run or uuid.uuid4().hex, "source": source}
         if part is not None:
             about["part"] = str(part)
@@ -75,6 +80,8 @@ class RecordingWriter:
                 self._mcap.start(library=f"caneflow {caneflow.__version__}")
                 self._mcap.add_metadata("caneflow", about)
                 self._mcap.add_metadata("rig", bolted_on)
+                for name, content in records.items():
+                    self._mcap.add_metadata(name, {"json": json.dumps(content, allow_nan=False)})
                 self._flush()
         except RecordingError:
             if self.path.is_file() and not self.path.is_symlink():  # it holds nothing

@@ -60,6 +60,17 @@ def course(shape: Shape, length: float, width: float, corner_radius: float, laps
     return _from_heading(-walked if clockwise else walked, lap_length / (nodes - 1))
 
 
+def course_through(points: Floats) -> Course:
+    """The course through points (n, 2), m, that lie close to each other; it starts at the first, eased in its bends."""
+    steps = np.diff(points, axis=0)
+    walked = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+    nodes = round(float(walked[-1]) / _STEP) + 1
+    distance = np.linspace(0.0, walked[-1], nodes)
+    middle = 0.5 * (walked[1:] + walked[:-1])
+    heading = np.interp(distance, middle, np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))
+    return _from_heading(heading, float(walked[-1]) / (nodes - 1))
+
+
 def _from_heading(heading: Floats, step: float) -> Course:
     """The curve through nodes `step` apart whose directions are `heading`, eased."""
     heading = gaussian_filter1d(heading, _EASING / step, mode="nearest")

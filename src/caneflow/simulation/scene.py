@@ -4,6 +4,7 @@ Amplitudes are square roots of radar cross-sections (m^2), so that floor, wall, 
 ratio to each other; the receiver's noise is set from the floor (see radar.py).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple, TypeAlias
 
@@ -57,12 +58,27 @@ class Walker(NamedTuple):
         return np.stack([x, y, np.broadcast_to(self.offsets[:, 1], x.shape)], axis=-1)
 
 
+class Passer(NamedTuple):
+    """A person of p scatterers who comes straight along x0, and may stop."""
+
+    points: Floats  # (p, 3) m, at time 0
+    velocity: float  # m/s along x0
+    halt: float  # s after which the person stands
+    amplitudes: Complexes  # (p,) m
+
+    def positions(self, time: Floats) -> Floats:
+        """Where the scatterers are at `time` (b,) s: (b, p, 3) m."""
+        moved = self.velocity * np.minimum(time, self.halt)
+        places: Floats = self.points + moved[:, None, None] * np.array([1.0, 0.0, 0.0])
+        return places
+
+
 class Scene(NamedTuple):
     """Everything that scatters."""
 
     points: Floats  # (k, 3) m
     amplitudes: Complexes  # (k,) m
-    walker: Walker | None
+    walker: Walker | Passer | None
     floor_reflectivity: float  # m^2 per m^2
 
 
@@ -90,6 +106,32 @@ def scene(settings: SceneSettings, course: Course, rng: Generator) -> Scene:
     amplitudes = np.concatenate([amplitudes for _, amplitudes in parts])
     walker = _walker(course, person_rng) if settings.person else None
     return Scene(points, amplitudes, walker, settings.floor_reflectivity)
+
+
+def with_boxes(room: Scene, boxes: Sequence[tuple[Floats, float]], passer: Passer | None, rng: Generator) -> Scene:
+    """The same with scatterers all over boxes (x0, x1, y0, y1, z0, z1 in m; m^2 per m^2), and one who passes."""
+    parts = [(room.points, room.amplitudes)]
+    for box, reflectivity in boxes:
+        low, high = box[0::2], np.minimum(box[1::2], [np.inf, np.inf, _WALL_HEIGHT])
+        low = np.maximum(low, [-_MARGIN, -np.inf, 0.0])
+        size = high - low
+        if size.min() <= 0.0:
+            continue
+        area = 2.0 * float(size[0] * size[1] + size[1] * size[2] + size[0] * size[2])
+        count = int(rng.poisson(_WALL_DENSITY * area))
+        points = rng.uniform(low, high, (count, 3))
+        faces = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
+        axis = rng.choice(3, count, p=faces / faces.sum())
+        points[np.arange(count), axis] = np.where(rng.random(count) < 0.5, low[axis], high[axis])
+        parts.append((points, _amplitudes(count, reflectivity / _WALL_DENSITY, rng)))
+    points, amplitudes = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return Scene(points, amplitudes, passer, room.floor_reflectivity)
+
+
+def passer(box: Floats, velocity: float, halt: float, rng: Generator) -> Passer:
+    """A person within a box (x0, x1, y0, y1, z0, z1), m."""
+    points = rng.uniform(box[0::2], box[1::2], (16, 3))
+    return Passer(points, velocity, halt, _amplitudes(16, _PERSON_SECTION / 16.0, rng))
 
 
 def _floor(settings: SceneSettings, low: Floats, high: Floats, rng: Generator) -> tuple[Floats, Complexes]:

@@ -83,6 +83,7 @@ class MotionSettings:
 
     # The hand and the cane
     hand_ahead: float = 0.35  # m in front of the body, chosen: forearm forward
+    hand_aside: float = 0.0  # m to the left of the body's middle
     hand_height_error: NotNegative = 0.01  # m, sd of the person's hand about the rig's nominal height, chosen
     swing: NotNegative = 20.0 * DEGREE  # rad, amplitude (cane.md: about +-20 deg)
     swing_variation: NotNegative = 0.08  # of the swing, sd, chosen
@@ -150,13 +151,15 @@ def course_of(settings: MotionSettings) -> Course:
     )
 
 
-def walk(settings: MotionSettings, rig: Rig, rng: Generator, duration: float | None = None) -> Motion:
-    """A walk of `duration` s; by default until it has been walked to its end.
+def walk(
+    settings: MotionSettings, rig: Rig, rng: Generator, duration: float | None = None, track: Course | None = None
+) -> Motion:
+    """A walk of `duration` s, by default until it has been walked to its end, along `track` or the settings' course.
 
     A shorter walk is the beginning of the longer one; a longer one ends in standing. `rng` makes the person.
     Raises ValueError when a pause does not lie on the course.
     """
-    track = course_of(settings)
+    track = track or course_of(settings)
     pace = _pace(track, settings, rng)
     legs = _legs(pace, settings)
     ends = legs[-1].end + settings.rest_after
@@ -276,7 +279,7 @@ def _hand(
     # a speed that swings by the part `surge` over a step is an offset that swings by its integral
     surge = settings.surge * settings.step_length / (2.0 * np.pi) * np.sin(2.0 * np.pi * steps)
     ahead = settings.hand_ahead + surge
-    aside = settings.sway * np.sin(np.pi * steps)
+    aside = settings.hand_aside + settings.sway * np.sin(np.pi * steps)
     height = rig.hand_height + rng.normal(0.0, 1.0) * settings.hand_height_error
     cos, sin = np.cos(heading), np.sin(heading)
     hand = np.stack(
