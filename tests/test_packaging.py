@@ -15,7 +15,7 @@ UNIT = ROOT / "deploy" / "caneflow@.service"
 def test_every_room_is_packaged() -> None:
     packages = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
     rooms = {".".join(path.parent.relative_to(ROOT / "src").parts) for path in (ROOT / "src").rglob("__init__.py")}
-    programs = {f"caneflow.{room}" for room in ("operators", "drivers", "tools")}
+    programs = {f"caneflow.{room}" for room in ("operators", "drivers", "tools", "flows")}
     assert packages == rooms | programs
 
 

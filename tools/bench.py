@@ -13,10 +13,12 @@ import numpy as np
 import typer
 
 from caneflow.messages import MessageError, Sample, decode
+from caneflow.options import FlowFile
 from caneflow.recording import Recording
 from caneflow.runtime import Emitted, Operator
 from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.dataflow.shipped import flow_for
 from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
@@ -38,7 +40,7 @@ class Benchmark:
 
 def command(
     recording: Annotated[Path, typer.Argument(metavar="REC", help="The recording.", show_default=False)],
-    file: Annotated[Path, typer.Option("--flow", metavar="FILE", help="The dataflow.")] = Path("dataflow.yaml"),
+    file: FlowFile = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting (may be given again)."),
@@ -52,7 +54,7 @@ def command(
 
     Example: caneflow bench walk.mcap --set ground_speed.with_velocity=false
     """
-    measured = benchmark(load(file, settings or ()), recording, repeat)
+    measured = benchmark(load(flow_for([recording], file), settings or ()), recording, repeat)
     if as_json:
         print(json.dumps(described(recording, measured), indent=2))
         return

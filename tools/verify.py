@@ -7,14 +7,23 @@ from typing import Annotated
 
 import typer
 
+from caneflow.errors import CaneflowError
 from caneflow.printable import printable
 from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.dataflow.shipped import flow_for
 from caneflow.runtime.replays.verification import ACROSS_PLATFORMS, Verdict, verify
 
 
 def command(
-    file: Annotated[Path, typer.Argument(help="The dataflow, e.g. dataflow.yaml.")],
-    recording: Annotated[Path, typer.Argument(metavar="REC", help="A recording with the outputs of a run.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[FILE] REC",
+            help="The dataflow, by default the folder's dataflow.yaml or else the one of caneflow's own that fits; "
+            "and a recording with the outputs of a run.",
+            show_default=False,
+        ),
+    ],
     tolerance: Annotated[
         float | None,
         typer.Option(
@@ -38,6 +47,10 @@ def command(
 
     Example: caneflow verify dataflow.yaml field.mcap --tolerance 1e-9
     """
+    if len(files) > 2:
+        raise CaneflowError(f"verify takes one dataflow and one recording, not {len(files)} files")
+    recording = files[-1]
+    file = flow_for([recording], files[0] if len(files) == 2 else None)
     verification = verify(load(file, settings or ()), recording, tolerance=tolerance)
     if as_json:
         streams = {verdict.stream: _plain(verdict) for verdict in verification.verdicts}

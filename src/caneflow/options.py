@@ -1,4 +1,4 @@
-"""Options that several tools share: where the running flow is that they attach to, and whether files are replaced."""
+"""Options that several tools share: where the flow runs or lies that they mean, and whether files are replaced."""
 
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -13,3 +13,12 @@ Keys: TypeAlias = Annotated[
     Path, typer.Option("--keys", metavar="DIR", help="Of --at tls/...: the folder with a key and ca.crt.")
 ]
 Overwrite: TypeAlias = Annotated[bool, typer.Option("--overwrite", help="Replace what exists under the output's name.")]
+FlowFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--flow",
+        metavar="FILE",
+        help="The dataflow; by default the folder's dataflow.yaml, else the one that comes with caneflow and fits.",
+        show_default=False,
+    ),
+]
