@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
+import psutil
 import pytest
 
 from caneflow.recording import Recording
@@ -25,7 +26,7 @@ from caneflow.runtime.hosts.launcher.requests import Answer, Restart, RestartAsk
 from caneflow.runtime.hosts.launcher.restarts import Again, How, Restarts
 from caneflow.runtime.hosts.launcher.run_log import LoggedLine, RunLog
 from caneflow.runtime.stages.merge import BEGIN, END
-from tests.flows import CANEFLOW, Launched, as_stranger, launchers, write_walk
+from tests.flows import CANEFLOW, Launched, as_stranger, launchers, wait_for, write_walk
 
 TICKER = '''
 """A live source that ticks at 50 Hz."""
@@ -118,6 +119,11 @@ def launch(base: Path, tmp_path: Path) -> Iterator[Callable[..., Launched]]:
         yield lambda *words: start(*words, log=tmp_path / "run.log", inside=["env", f"XDG_RUNTIME_DIR={base}"])
 
 
+def kept(printed: str) -> list[LoggedLine]:
+    """What `caneflow logs --json` printed."""
+    return [msgspec.json.decode(line, type=LoggedLine) for line in printed.splitlines()]
+
+
 def test_a_flow_is_operated_from_another_terminal(
     written: Path, launch: Callable[..., Launched], caneflow: Caneflow, tmp_path: Path
 ) -> None:
@@ -129,12 +135,12 @@ def test_a_flow_is_operated_from_another_terminal(
     assert (about["replay"], about["nodes"], about["ready"]) == (False, 3, 3)
 
     before = json.loads(caneflow("status", flow, "--json").stdout)["nodes"]
-    for node in ("echo", "ticker", "recorder"):
+    for node in ("echo", "recorder"):
         assert f"{flow}: {node} is ready again" in caneflow("restart", flow, node).stdout
     after = json.loads(caneflow("status", flow, "--json").stdout)["nodes"]
-    assert all(before[node]["pid"] != after[node]["pid"] for node in before)
+    assert [before[node]["pid"] != after[node]["pid"] for node in before] == [False, True, True]
     assert {node["restarts"] for node in after.values()} == {0}, "only failures are counted"
-    assert {node["asked"] for node in after.values()} == {1}
+    assert [node["asked"] for node in after.values()] == [0, 1, 1]
     refused = caneflow("restart", flow, "ecko")
     said = "no node 'ecko'; did you mean 'echo'? there are ticker, echo, recorder"
     assert (refused.returncode, refused.stdout, refused.stderr) == (2, "", f"caneflow restart: {said}\n")
@@ -152,13 +158,40 @@ def test_a_flow_is_operated_from_another_terminal(
     again = caneflow("stop", flow)
     assert (again.returncode, again.stdout, len(again.stderr.splitlines())) == (2, "", 1)
 
-    kept = [json.loads(line) for line in caneflow("logs", flow, "--json", "--grep", "begins").stdout.splitlines()]
-    assert [(line["node"], line["level"], line["text"]) for line in kept] == [
-        ("ticker", "info", r"begins \x1b[31m")
-    ] * 2
-    assert caneflow("logs", flow, "--since", "0s").stdout == ""
+    (line,) = kept(caneflow("logs", flow, "--json", "--grep", "begins").stdout)
+    assert (line.node, line.level, line.text) == ("ticker", "info", r"begins \x1b[31m")
     ended = {each["flow"]: each for each in json.loads(caneflow("list", "--ended", "--json").stdout)}[flow]
     assert (ended["run"], ended["status"], ended["lost"]) == (1, 130, [])
+
+
+def test_a_flow_goes_on_in_the_background_with_its_page(written: Path, caneflow: Caneflow, tmp_path: Path) -> None:
+    """The pipe that the command writes to is free when it has ended: `subprocess.run` waits for that."""
+    flow = re.sub(r"\W", "", tmp_path.name).lower()
+    begun = caneflow("run", written, "--detach", "--view")
+    assert begun.returncode == 0, begun.stderr
+    assert re.match(rf"{flow} runs \(pid \d+\)\n", begun.stdout)
+    pid = int(re.findall(r"\d+", begun.stdout.removeprefix(flow))[0])
+    launcher = psutil.Process(pid)
+    started = [launcher, *launcher.children(recursive=True)]
+
+    def page() -> list[str]:
+        return [each.text for each in kept(caneflow("logs", flow, "--node", "the page", "--json").stdout)]
+
+    wait_for(page, "the page's address")
+    assert page()[0].startswith("http://127.0.0.1:")
+    assert caneflow("stop", flow).returncode == 0
+    left = [each for each in started if each.is_running() and each.status() != psutil.STATUS_ZOMBIE]
+    assert not left
+
+
+def test_what_is_wrong_at_the_start_is_told_before_it_goes_to_the_background(written: Path, caneflow: Caneflow) -> None:
+    (written.parent / "echo.py").write_text(ECHO.replace('logging.getLogger(__name__).warning("is built")', "1 / 0"))
+    ended = caneflow("run", written, "--detach")
+    assert (ended.returncode, "runs (pid" in ended.stdout) == (1, False)
+    assert "ZeroDivisionError" in ended.stderr.splitlines()[-1]
+    written.write_text(FLOW.replace("ticker/imu", "ticker/no"))
+    ended = caneflow("run", written, "--detach")
+    assert (ended.returncode, ended.stdout) == (2, "")
 
 
 def test_a_terminal_shows_how_far_a_replay_is(written: Path, tmp_path: Path) -> None:
@@ -202,11 +235,10 @@ def test_a_log_is_private_bounded_and_without_control_characters(
     assert folder.stat().st_mode & 0o777 == 0o700
     assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {0o600}
     assert sum(path.stat().st_size for path in folder.glob("*.jsonl")) < 2 * 2_000 + run_log.LONGEST_LINE + 200
-    kept = KeptLog(
-        folder=folder, run=msgspec.json.decode((folder / run_log.ABOUT).read_bytes(), type=run_log.LoggedRun)
-    )
-    assert (kept.running, kept.run.status, kept.run.lost) == (False, 130, ("fusion: imu: 3 lost",))
-    *lines, longest = kept.lines()
+    about = msgspec.json.decode((folder / run_log.ABOUT).read_bytes(), type=run_log.LoggedRun)
+    log_of_run = KeptLog(folder=folder, run=about)
+    assert (log_of_run.running, about.status, about.lost) == (False, 130, ("fusion: imu: 3 lost",))
+    *lines, longest = log_of_run.lines()
     assert [line.text for line in lines] == [
         rf"{number}\x1b[2J\x9b\u202e" for number in range(100 - len(lines), 100)
     ], "the last of them"
@@ -221,8 +253,8 @@ def test_the_last_logs_are_kept_and_those_in_use(tmp_path: Path, monkeypatch: py
         for flow in ("b", "c", "d", "e"):
             with RunLog(root, flow, replay=True):
                 pass
-        kept = {path.name[0] for path in (tmp_path / "root" / run_log.LOGS).iterdir()}
-    assert kept == {"a", "c", "d", "e"}, "the last three, and the one that goes on"
+        left = {path.name[0] for path in (tmp_path / "root" / run_log.LOGS).iterdir()}
+    assert left == {"a", "c", "d", "e"}, "the last three, and the one that goes on"
 
 
 def test_a_log_that_grows_is_followed_through_its_rotation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,7 +332,7 @@ def test_without_a_terminal_there_is_a_line_now_and_then(monkeypatch: pytest.Mon
     clock = [100.0]
     monkeypatch.setattr("caneflow.runtime.hosts.launcher.console.time.monotonic", lambda: clock[0])
     stream = io.StringIO()
-    with Console(stream) as shown:
+    with Console("cane", stream=stream) as shown:
         shown.settled()
         for second in range(1, 26):
             clock[0] = 100.0 + second

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ from caneflow.runtime.dataflow.loading import load, read_rig
 from caneflow.runtime.deployment import Deployment, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
+from caneflow.runtime.hosts.launcher.background import in_background
 from caneflow.runtime.hosts.launcher.console import Console
 from caneflow.runtime.hosts.launcher.fork_server import ForkServer
 from caneflow.runtime.hosts.launcher.launcher import Launcher
@@ -66,6 +68,10 @@ def command(
         str | None,
         typer.Option(metavar="tcp/HOST:PORT", help="let other programs attach here, beside where the file says"),
     ] = None,
+    view: Annotated[bool, typer.Option("--view", help="open the flow's page in the browser; it ends with it")] = False,
+    detach: Annotated[
+        bool, typer.Option("--detach", help="go on in the background when every node is ready; `caneflow stop` ends it")
+    ] = False,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -101,13 +107,15 @@ def command(
     Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record out.mcap --set fusion.method=kalman
     """
     raise_limit()
+    _require_processes(in_process=in_process, view=view, detach=detach)
+    background = in_background() if detach else None
     recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
     if record is not None:
         record = named_at(record, datetime.now(UTC))
     # The recording's name first, before any process; then the fork server: what is there now is there in every node.
     with (
         _kept(record, [file, replay, rig], overwrite=overwrite, parts=bool(recorder)),
-        nullcontext() if in_process else ForkServer() as fork_server,
+        nullcontext() if in_process else ForkServer(silent=detach) as fork_server,
     ):
         graph = load(file, settings or ())
         for warning in graph.warnings:
@@ -134,9 +142,9 @@ def command(
             outcome = InProcess(deployment, programs).run_until_interrupted()
         else:
             restarts = {name: node.restart for name, node in graph.nodes.items()}
-            with Console() as console:
-                launcher = Launcher(deployment, restarts, console, fork_server, keys or file.parent / "keys")
-                outcome = launcher.run()
+            keys = keys or file.parent / "keys"
+            with Console(deployment.flow, background) as console:
+                outcome = Launcher(deployment, restarts, console, fork_server, keys, view=view).run()
         summary(deployment, outcome, time.monotonic() - started)
         raise typer.Exit(outcome.status)
 
@@ -189,6 +197,15 @@ def _recorder(
         return {}
     rotation = Rotation.read(rotate, keep)
     return {"rotate_bytes": rotation.size, "rotate_s": rotation.span_s, "keep": rotation.keep}
+
+
+def _require_processes(*, in_process: bool, view: bool, detach: bool) -> None:
+    """Raise an error for what a run in this process does not have, and for a page that cannot be had."""
+    if in_process and (view or detach):
+        option = "--view" if view else "--detach"
+        raise DataflowError(f"{option}: nobody can attach to a flow in one process; leave --in-process out")
+    if view and find_spec("uvicorn") is None:
+        raise DataflowError("--view: no uvicorn here; `pip install 'caneflow[view]'` brings it")
 
 
 def _listen(endpoint: str | None, *, in_process: bool) -> str | None:

@@ -183,3 +183,7 @@ def _no_options() -> None:
 
 def _typer(**settings: Any) -> typer.Typer:
     return typer.Typer(pretty_exceptions_enable=False, rich_markup_mode="rich", **settings)
+
+
+if __name__ == "__main__":
+    run()

@@ -7,9 +7,13 @@ import time
 from typing import TextIO
 
 from caneflow.printable import printable
+from caneflow.runtime.hosts.launcher.background import Background
 
 LINE_PERIOD = 10.0  # s between two lines about a replay where there is no terminal
 BAR = 24  # characters
+IN_BACKGROUND = """{flow} runs (pid {pid})
+to look:    caneflow view {flow}, caneflow status {flow}, caneflow logs {flow} --follow
+to end it:  caneflow stop {flow}"""
 NARROW = 60  # columns of a terminal in which a bar has no room
 
 
@@ -20,7 +24,9 @@ class Console:
     the cursor, which a killed command would never show again.
     """
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+    def __init__(self, flow: str, background: Background | None = None, stream: TextIO | None = None) -> None:
+        """`background`: where the command that started the run waits for it to be settled."""
+        self._flow, self._background = flow, background
         self._stream = stream or sys.stderr
         self._redraws = self._stream.isatty() and os.environ.get("TERM", "dumb") != "dumb"
         self._began = self._said_at = time.monotonic()
@@ -40,7 +46,10 @@ class Console:
         self._show(shown)
 
     def settled(self) -> None:
-        """From here on the pace of a replay counts."""
+        """From here on the pace of a replay counts; who only waited for the start is told how to go on."""
+        if self._background is not None:
+            self._background.let_go(IN_BACKGROUND.format(flow=self._flow, pid=os.getpid()))
+            self._redraws = False
         self._began = self._said_at = time.monotonic()
 
     def played(self, played_s: float, of_s: float | None) -> None:

@@ -17,6 +17,7 @@ import signal
 import socket
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -24,6 +25,7 @@ from typing import NoReturn
 import msgspec
 from setproctitle import setproctitle, setthreadtitle
 
+from caneflow.runtime.hosts.launcher.background import silence
 from caneflow.runtime.hosts.process.last_words import telling_failures
 from caneflow.runtime.user_files import run_as_main
 
@@ -51,14 +53,16 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
 class ForkServer:
     """The launcher's end: start nodes, and hear of their ends; a context manager that leaves none."""
 
-    def __init__(self) -> None:
-        """Fork the fork server; to be done before this process has any thread."""
+    def __init__(self, *, silent: bool = False) -> None:
+        """Fork the fork server; to be done before this process has any thread. `silent`: nobody hears its own bugs."""
         self._socket, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # Ctrl-C reaches both processes: the fork server must not take it as the launcher would.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, FROM_OUTSIDE)
         self.pid = os.fork()
         if self.pid == 0:
             self._socket.close()
+            if silent:
+                silence()
             _end(lambda: _Parent(inner).serve())
         inner.close()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -184,6 +188,8 @@ def _become(arguments: Sequence[str], output: int, plan: int | None = None, *, p
     with telling_failures(building=True):  # before the program has come to its own `run`
         if arguments[0] == "-m":
             sys.argv = list(arguments[1:])
+            # A word of the command is a module that this process, a fork, has already.
+            warnings.filterwarnings("ignore", ".* found in sys.modules", RuntimeWarning)
             runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
         else:
             sys.argv = list(arguments)

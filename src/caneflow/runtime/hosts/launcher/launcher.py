@@ -42,6 +42,7 @@ from caneflow.runtime.stages.merge import BEGIN
 STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them: 5 s in all
 LEADER_PATIENCE = 120.0  # s that the part of a replay waits for its leader to come back
 WAITING_SAID = 10.0  # s after which a launcher says again whom it waits for
+PAGE = "the page"  # no node can be called so
 WAKE_PERIOD = 0.2  # s between two looks at deadlines
 
 
@@ -55,11 +56,14 @@ class Launcher:
         watcher: Watcher,
         fork_server: ForkServer,
         keys: Path | None = None,
+        *,
+        view: bool = False,
     ) -> None:
-        """`keys`: the folder with this machine's certificate, where the flow has several machines."""
+        """`keys`: the folder with this machine's certificate, where it has one. `view`: open the page at the start."""
         self._run = secrets.token_hex(8)  # nobody can guess the ids of its nodes' sessions
         self._fork_server = fork_server
         self._keys = keys
+        self._view = view
         self._events: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._restarts = restarts
         self._watcher = watcher
@@ -193,6 +197,8 @@ class Launcher:
                 if there and self._started_s is not None:
                     self._say_start()
                 self._begin_if_all_are_ready()
+            case Exited(node) if node not in self._nodes:
+                self._processes.forget(event)
             case Exited():
                 self._processes.forget(event)
                 if not self._asked.ended(event):
@@ -228,6 +234,9 @@ class Launcher:
             self._started_s = time.monotonic()
             self._say(LAUNCHER, f"ready: {len(self._nodes.here)} nodes; to look: caneflow view {self._deployment.flow}")
             self._watcher.settled()
+            if self._view:
+                words = ("view", self._deployment.flow, "--at", self._endpoint, "--open")
+                self._processes.start_program(PAGE, ("-m", "caneflow.words", *words))
 
     # --- what goes out ----------------------------------------------------------------------------------------
 

@@ -88,7 +88,10 @@ class Nodes:
         return {node.plan.node: node.counters for node in self if node.counters is not None}
 
     def take_line(self, name: str, text: str) -> None:
-        """Report a line that a node wrote."""
+        """Report a line that a node, or a program beside them, wrote."""
+        if name not in self:
+            self._say(name, text)
+            return
         for line, level in self[name].take_line(text):
             self._say(name, line, level)
 

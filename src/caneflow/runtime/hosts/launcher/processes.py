@@ -73,9 +73,10 @@ class Processes:
         Its pid, or 0 when the fork server is lost. Raises OSError when this process has no descriptors left.
         """
         with _in_memory(plan) as descriptor:
-            return self._start(node, [*program, str(called)], descriptor)
+            return self.start_program(node, [*program, str(called)], descriptor)
 
-    def _start(self, node: str, arguments: Sequence[str], plan: int) -> int:
+    def start_program(self, node: str, arguments: Sequence[str], plan: int | None = None) -> int:
+        """Start what follows `python`, under the name `node`; `plan`: a descriptor of what its last argument names."""
         reading, writing = os.pipe()
         lines = os.fdopen(reading, encoding="utf-8", errors="replace")
         process = _Process(node, threading.Thread(target=self._read, args=(node, lines), daemon=True))
