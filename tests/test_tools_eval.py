@@ -17,9 +17,17 @@ from caneflow.algorithms.judging.error_summary import consistent_mean
 from caneflow.messages import Pose
 from caneflow.recording import TRUTH, Recording, RecordingWriter
 from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.dataflow.shipped import flow_for
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import Emitted, Operator
-from caneflow.runtime.replays.evaluation import FIGURES, chosen_methods, estimates, evaluated, offered_methods
+from caneflow.runtime.replays.evaluation import (
+    FIGURES,
+    chosen_methods,
+    estimates,
+    evaluated,
+    offered_methods,
+    without_nodes,
+)
 from caneflow.runtime.replays.results_file import ResultsFile
 from caneflow.runtime.replays.workers import mapped_on_cluster
 from tools import evaluate, simulate
@@ -113,6 +121,29 @@ def test_methods_that_run_side_by_side_give_what_each_gives_alone(walks: list[Pa
     for method in METHODS:
         alone, _ = estimates(graph, walks[0], [method])
         assert (alone[method].track.positions == together[method].track.positions).all(), method
+
+
+def test_without_the_radar_what_needs_none_is_the_same(answer: tuple[dict[str, Any], Path], walks: list[Path]) -> None:
+    without = ["radar", "ground_speed"]
+    (result,) = evaluated(FLOW, walks[:1], ["naive_ins"], without=without)
+    assert result.figures["naive_ins"] == answer[0]["naive_ins"][str(walks[0])]
+    with pytest.raises(DataflowError, match="--without sonar: no such node; there are"):
+        without_nodes(load(FLOW), ["sonar"])
+    with pytest.raises(DataflowError, match="room_tracker: --without leaves it no input; leave it out too"):
+        without_nodes(load(ROOT / "dataflows" / "room.yaml"), ["south_line", "west_line", "attitude"])
+
+
+def test_the_flow_is_the_one_here_or_beside_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, beside = tmp_path / "here", tmp_path / "beside"
+    here.mkdir()
+    beside.mkdir()
+    monkeypatch.chdir(here)
+    recording = beside / "walk.mcap"
+    (beside / "dataflow.yaml").touch()
+    assert flow_for([recording]) == beside / "dataflow.yaml"
+    (here / "dataflow.yaml").touch()
+    assert flow_for([recording]) == Path("dataflow.yaml")
+    assert flow_for([recording], FLOW) == FLOW
 
 
 @pytest.mark.long

@@ -14,11 +14,12 @@ from rich.console import Console
 from rich.progress import track
 
 from caneflow.algorithms.judging.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
-from caneflow.options import Overwrite
+from caneflow.options import FlowFile, Overwrite
 from caneflow.outputs import require_no_input, whole
 from caneflow.printable import printable
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.replays.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated
+from caneflow.runtime.dataflow.shipped import flow_for
+from caneflow.runtime.replays.evaluation import FIGURES, Evaluation, Figures, chosen_methods, evaluated, without_nodes
 from caneflow.runtime.replays.results_file import ResultsFile
 
 FAILED_STATUS = 1
@@ -55,7 +56,13 @@ def command(
             help="What to compare; by default all that fusion offers. Also: smoothed, best in hindsight.",
         ),
     ] = None,
-    flow: Annotated[Path, typer.Option(metavar="FILE", help="The dataflow.")] = Path("dataflow.yaml"),
+    flow: FlowFile = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NODE", help="Leave a node out, e.g. of a sensor that was not there (may be given again)."
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NODE.KEY=VALUE", help="Override a setting (may be given again)."),
@@ -88,13 +95,23 @@ def command(
     Example: caneflow eval walks/*.mcap --methods luenberger,best --jobs 2
     """
     recordings = list(dict.fromkeys(recordings))
+    flow = flow_for(recordings, flow)
+    left_out = without or []
     if results_file is not None:
         require_no_input(results_file, [flow, *recordings])
     with whole(csv_file, inputs=[flow, results_file, *recordings], overwrite=overwrite) as table:
         wanted = [word.strip() for word in methods.split(",")] if methods is not None else []
-        graph = load(flow, settings or ())
+        graph = without_nodes(load(flow, settings or ()), left_out)
         chosen = chosen_methods(graph, wanted)
-        run = partial(evaluated, flow, methods=chosen, overrides=settings or (), jobs=jobs, scheduler=scheduler)
+        run = partial(
+            evaluated,
+            flow,
+            methods=chosen,
+            overrides=settings or (),
+            jobs=jobs,
+            scheduler=scheduler,
+            without=left_out,
+        )
         with ResultsFile(results_file, graph, chosen) if results_file is not None else nullcontext() as kept:
             results = run(recordings) if kept is None else _resumed(kept, recordings, run)
             done = list(_shown(results, len(recordings)))

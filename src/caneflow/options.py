@@ -18,7 +18,7 @@ FlowFile: TypeAlias = Annotated[
     typer.Option(
         "--flow",
         metavar="FILE",
-        help="The dataflow; by default the folder's dataflow.yaml, else the one that comes with caneflow and fits.",
+        help="The dataflow; by default dataflow.yaml here or beside the recording, else a shipped one that fits.",
         show_default=False,
     ),
 ]

@@ -35,9 +35,10 @@ def shipped_text(name: str) -> str:
 
 
 def flow_for(recordings: Iterable[Path], given: Path | None = None) -> Path:
-    """The dataflow that a command on recordings means: the one that is `given`, else the folder's, else a shipped one.
+    """The dataflow that a command on recordings means.
 
-    The shipped one is that of the recording's flow by name, or the one most of whose drivers the recording holds.
+    The one that is `given`, else the folder's dataflow.yaml, else the one beside a recording, else a shipped one: that
+    of the recording's flow by name, or the one most of whose drivers the recording holds.
 
     Raises DataflowError when none fits, and RecordingError for a first recording that cannot be read.
     """
@@ -46,6 +47,8 @@ def flow_for(recordings: Iterable[Path], given: Path | None = None) -> Path:
     if USUAL.exists():
         return USUAL
     for path in recordings:
+        if (beside := path.parent / USUAL).exists():
+            return beside
         with Recording(path) as recording:
             nodes, flow = {node for node, _ in recording.streams}, recording.flow
         drivers = {name: _drivers(file) for name, file in shipped().items()}

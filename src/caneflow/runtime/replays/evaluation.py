@@ -93,14 +93,31 @@ def evaluated(
     jobs: int = 1,
     scheduler: str | None = None,
     keep_tracks: bool = False,
+    without: Sequence[str] = (),
 ) -> Iterator[Evaluation]:
     """An evaluation of each recording, in their order; with `jobs` > 1 in as many processes.
 
-    With the address of a Dask `scheduler`, by its workers. A recording or method that fails is in its evaluation's
-    `failures`. Raises DataflowError for a graph that cannot run at all.
+    With the address of a Dask `scheduler`, by its workers. `without`: nodes of the graph that are left out. A
+    recording or method that fails is in its evaluation's `failures`. Raises DataflowError for a graph that cannot run
+    at all.
     """
-    each = partial(_evaluate, flow, tuple(overrides), tuple(methods), keep_tracks)
+    each = partial(_evaluate, flow, tuple(overrides), tuple(methods), keep_tracks, tuple(without))
     return mapped(each, recordings, jobs) if scheduler is None else mapped_on_cluster(each, recordings, scheduler)
+
+
+def without_nodes(graph: Graph, names: Sequence[str]) -> Graph:
+    """The graph without some nodes and the wires from them; raises DataflowError for a node that has no input then."""
+    left_out = frozenset(names)
+    if unknown := left_out - graph.nodes.keys():
+        raise DataflowError(f"--without {min(unknown)}: no such node; there are {listed(graph.nodes)}")
+    nodes = {}
+    for name, node in graph.nodes.items():
+        if name not in left_out:
+            inputs = {port: wire for port, wire in node.inputs.items() if wire.node not in left_out}
+            if node.inputs and not inputs:
+                raise DataflowError(f"{name}: --without leaves it no input; leave it out too")
+            nodes[name] = replace(node, inputs=inputs)
+    return replace(graph, nodes=nodes)
 
 
 def estimates(graph: Graph, recording: Path, methods: Sequence[str]) -> tuple[dict[str, Estimate], dict[str, str]]:
@@ -143,9 +160,15 @@ def figures_of(estimate: Estimate, truth: Track | None, boresight: Vector) -> Fi
 
 
 def _evaluate(
-    flow: Path, overrides: Sequence[str], methods: Sequence[str], keep_tracks: bool, recording: Path
+    flow: Path,
+    overrides: Sequence[str],
+    methods: Sequence[str],
+    keep_tracks: bool,
+    without: Sequence[str],
+    recording: Path,
 ) -> Evaluation:
-    graph = load(flow, overrides)  # here, as a user's own program cannot be sent to another process
+    # The graph is loaded here, as a user's own program cannot be sent to another process.
+    graph = without_nodes(load(flow, overrides), without)
     try:
         truth, boresight = _known_of(graph, recording)
     except (CaneflowError, ValueError) as error:  # ValueError: a rig or a truth that makes no sense
