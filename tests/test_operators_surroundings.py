@@ -14,6 +14,7 @@ from caneflow.algorithms.surroundings.sensor_rays import zone_directions
 from caneflow.messages import Cue, Grid, Imu, MessageError, Obstacles, Pose, Ranges, Sample, numbered
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.runtime import Context, Refused
+from caneflow.runtime.dataflow.loading import examine
 from caneflow.runtime.dataflow.programs import check_settings
 from caneflow.runtime.stages.snapshot import pack, unpack
 from operators.surroundings import Surroundings
@@ -315,3 +316,26 @@ def test_a_reference_approach_is_told_of_in_time(
 
 def test_the_rig_of_the_flow_is_sound() -> None:
     assert isinstance(read_rig(RIG), Rig)
+
+
+GUIDE = ROOT / "dataflows" / "guide.yaml"
+
+
+def test_check_warns_of_a_pose_that_is_not_good_enough_for_a_map() -> None:
+    assert not any("method" in str(problem) for problem in examine(GUIDE)[1])
+    graph, problems = examine(GUIDE, ["fusion.method=luenberger"])
+    assert graph is not None
+    (said,) = [str(problem) for problem in problems if "method" in str(problem)]
+    assert "warning: nodes.surroundings.inputs.pose: comes from the method luenberger" in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [("rangers:", "sensors_of_mine:", "rig.rangers: is missing"), ("    tof_up:", "    upper:", "has no tof_up")],
+)
+def test_check_names_a_rig_without_the_range_sensors(old: str, new: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "guide.yaml"
+    path.write_text(GUIDE.read_text().replace(old, new, 1))
+    graph, problems = examine(path)
+    assert graph is None
+    assert any(says in str(problem) for problem in problems)

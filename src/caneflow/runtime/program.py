@@ -59,6 +59,22 @@ class Context:
     random: np.random.Generator  # from the graph's seed and the node's name: other nodes do not change it
 
 
+class InFlow(NamedTuple):
+    """How a graph uses a program, as far as a check of the file knows it."""
+
+    node: str
+    rig: Mapping[str, Any]  # as written
+    writers: Mapping[str, Any]  # by input port the settings of the node that writes it; None: not known
+
+
+class Objection(NamedTuple):
+    """What a program finds wrong with the graph around it."""
+
+    path: tuple[str, ...]  # in the file, e.g. ("rig", "rangers")
+    text: str
+    warning: bool = False
+
+
 class Operator(ABC):
     """Messages in, messages out, in event time: no socket, no thread, no clock."""
 
@@ -69,6 +85,11 @@ class Operator(ABC):
 
     @abstractmethod
     def __init__(self, settings: Any, context: Context) -> None: ...
+
+    @classmethod
+    def objections(cls, flow: InFlow) -> Iterable[Objection]:
+        """What `caneflow check` should say of the graph around the program, beyond types and settings."""
+        return ()
 
     @abstractmethod
     def handle(self, port: str, message: Sample) -> Emitted:

@@ -14,6 +14,7 @@ from caneflow.runtime.dataflow.wiring import Part, check_wires, external_outputs
 from caneflow.runtime.dataflow.yaml_file import MAX_DEPTH, Document, compose, read_yaml
 from caneflow.runtime.dataflow.yaml_shape import FlowShape, NodeShape, RestartShape, is_written, read_shape
 from caneflow.runtime.errors import DataflowError, Place, Problem
+from caneflow.runtime.program import InFlow, Operator
 from caneflow.runtime.wording import did_you_mean, listed, one_line, shown
 
 GIVEN_RIG = "rig of the recording or --rig"
@@ -79,6 +80,7 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
     check_wires(document, flow, parts)
     layout = check_machines(document, flow, parts)
     nodes = {name: _node(document, name, part, layout.places[name]) for name, part in parts.items()}
+    _ask_programs(document, nodes)
     if any(not problem.warning for problem in document.problems):
         document.problems = [problem for problem in document.problems if not problem.warning]
         return None
@@ -105,6 +107,18 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
         leader=layout.leader,
         warnings=tuple(map(str, _sorted(document))),
     )
+
+
+def _ask_programs(document: Document, nodes: Mapping[str, Node]) -> None:
+    """Note what the programs themselves say against the graph around them."""
+    rig = document.value.get("rig", {})
+    for name, node in nodes.items():
+        if node.program is not None and issubclass(node.program, Operator) and isinstance(rig, dict):
+            writers = {
+                port: nodes[wire.node].settings if wire.node in nodes else None for port, wire in node.inputs.items()
+            }
+            for path, text, warning in node.program.objections(InFlow(name, rig, writers)):
+                document.problem(path, text, key=True, warning=warning)
 
 
 def _part(document: Document, name: str, shape: NodeShape, base: Path) -> Part:
