@@ -138,6 +138,105 @@ def test_a_router_lets_a_machine_say_what_is_its_own_and_nothing_else(file: Path
     assert set(heard) == {pose}
 
 
+ALONE = """
+flow: {flow}
+router: {router}
+machines: {{here: {{}}}}
+nodes:
+  imu: {{external: true, outputs: {{imu: Imu}}}}
+  attitude: {{run: operators.attitude, inputs: {{imu: imu/imu}}}}
+results: [attitude/imu]
+"""
+
+
+@contextmanager
+def behind(endpoint: str, tls: dict[str, object] | None = None, mode: str = "client") -> Iterator[zenoh.Session]:
+    """A program that knows only the router."""
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    if tls:
+        config.insert_json5("transport/link/tls", json.dumps(tls))
+    with zenoh.open(config) as session:
+        yield session
+
+
+def fed_and_heard(flow: str, feeder: zenoh.Session, listener: zenoh.Session) -> None:
+    """What one program puts on the external node's key comes back to another as an attitude."""
+    heard = list[str]()
+    held = listener.declare_subscriber(f"{flow}/attitude/*", lambda sample: heard.append(str(sample.key_expr)))
+    begin, seq = time.time_ns() - 10**10, 0
+
+    def feed() -> bool:  # again and again, as it takes a moment until all know who reads what
+        nonlocal seq
+        imu = Imu(stamp=begin + seq * 10**7, gyro=(0.0, 0.0, 0.1), accel=(0.0, 0.0, 9.81))
+        feeder.put(f"{flow}/imu/imu", numbered(imu, seq))
+        feeder.put(f"{flow}/attitude/forged", numbered(imu, seq))
+        seq += 1
+        return heard.count(f"{flow}/attitude/imu") > 3
+
+    wait_for(feed, "attitudes")
+    assert held is not None, "one without a name would be gone"
+
+
+def test_one_machine_dials_its_router_too_and_runs_without(launch: Launch, tmp_path: Path) -> None:
+    flow, endpoint, file = f"r{time.time_ns()}", f"tcp/127.0.0.1:{free_port()}", tmp_path / "alone.yaml"
+    file.write_text(ALONE.format(flow=flow, router=endpoint))
+    running = launch("run", file, log=tmp_path / "log")
+    running.wait_for(f"other programs attach at {endpoint} (mode client); every user of this machine can read there")
+    running.wait_for("ready: ")  # there is no router yet
+    with router(in_the_clear(endpoint)), behind(endpoint) as feeder, behind(endpoint, mode="peer") as listener:
+        fed_and_heard(flow, feeder, listener)
+    running.process.terminate()
+    assert running.ends() == 130
+
+
+def test_a_router_dials_a_machine_that_listens(launch: Launch, tmp_path: Path) -> None:
+    flow, here, there = f"r{time.time_ns()}", f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
+    file = tmp_path / "alone.yaml"
+    file.write_text(ALONE.format(flow=flow, router="").replace("router: \n", ""))
+    running = launch("run", file, "--listen", here, log=tmp_path / "log")
+    running.wait_for("ready: ")
+    config = in_the_clear(there)
+    config.insert_json5("connect/endpoints", json.dumps([here]))
+    with router(config), behind(there) as feeder, behind(there) as listener:
+        fed_and_heard(flow, feeder, listener)
+    running.process.terminate()
+    assert running.ends() == 130
+
+
+def test_one_machine_and_its_router_with_keys(launch: Launch, tmp_path: Path) -> None:
+    flow, file, keys = f"r{time.time_ns()}", tmp_path / "alone.yaml", tmp_path / "keys"
+    file.write_text(ALONE.format(flow=flow, router=f"tcp/127.0.0.1:{free_port()}"))
+    make_authority(keys)
+    for name in ("here", "router"):
+        make_certificate(keys, name)
+    make_certificate(keys, "laptop", observer=True)
+    running = launch("run", file, log=tmp_path / "log")
+    running.wait_for("who shows a certificate of this flow can read there")
+    endpoint = "tls/" + endpoint_in(file).partition("/")[2]
+    with (
+        router(secured(file)),
+        behind(endpoint, link_of(keys, "here")) as feeder,
+        behind(endpoint, link_of(keys, "laptop")) as listener,
+    ):
+        fed_and_heard(flow, feeder, listener)
+    running.process.terminate()
+    assert running.ends() == 130
+
+
+def link_of(keys: Path, name: str) -> dict[str, object]:
+    """Zenoh's TLS with the certificate of `name`."""
+    return {
+        "root_ca_certificate": str(keys / "ca.crt"),
+        "enable_mtls": True,
+        "connect_certificate": str(keys / f"{name}.crt"),
+        "connect_private_key": str(keys / f"{name}.key"),
+        "verify_name_on_connect": False,
+    }
+
+
 def test_machines_behind_a_router_need_no_links(file: Path, tmp_path: Path) -> None:
     graph, problems = examine(file, ())[:2]
     assert not problems

@@ -68,10 +68,14 @@ def router(
     own = certificates.credentials(folder, certificates.ROUTER)
     if own is None:
         raise DataflowError(f"{folder}: holds no certificate of the router; `caneflow keys add router` makes it")
+    if not graph.machines:
+        raise DataflowError(
+            f"{file}: names no machine, and the router knows machines by name; write machines: {{here: {{}}}}"
+        )
     deployment = deploy(graph, machine=next(iter(graph.machines)))
-    if deployment.site is None:
-        raise DataflowError(f"{file}: runs on one machine; there is nothing to pass on")
-    print(json.dumps(router_settings(deployment, deployment.site, own), indent=2))
+    site = deployment.site or deployment.door
+    assert site is not None, "it has a router"
+    print(json.dumps(router_settings(deployment, site, own), indent=2))
 
 
 def show(folder: Folder = DEFAULT_FOLDER) -> None:

@@ -143,8 +143,9 @@ def deploy(
 
 def _require_open(graph: Graph, plans: Mapping[str, NodePlan], here: Site | None) -> None:
     """Raise DataflowError when a program of somebody else's is part of the flow here and nobody listens for it."""
-    for name, plan in plans.items():
-        if plan.external and (here is None or (here.places.get(name, here.name) == here.name and not here.listen)):
+    for name in (name for name, plan in plans.items() if plan.external):
+        listens = here is not None and bool(here.listen or here.router)
+        if not listens and (here is None or here.places[name] == here.name):
             raise DataflowError(f"{graph.path}: nodes.{name}: {NOBODY_LISTENS}")
 
 

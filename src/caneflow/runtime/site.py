@@ -60,16 +60,23 @@ def site_of(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | Non
 
 
 def door_of(graph: Graph, listen: str | None) -> Site | None:
-    """Where the only machine of the graph, and `listen`, let other programs in; None: nowhere."""
+    """Where the only machine of the graph, and `listen`, let other programs in, and its router; None: nowhere."""
     used = list({node.machine: None for node in graph.nodes.values()})
     if len(used) != 1:
         return None
     name = used[0] or ""
-    written = graph.machines[name].listen if name else ()
-    places = dict.fromkeys(graph.nodes, name)
-    site = Site(name=name, leader=name, others=(), places=places, listen=written, connect=(), insecure=graph.insecure)
+    site = Site(
+        name=name,
+        leader=name,
+        others=(),
+        places=dict.fromkeys(graph.nodes, name),
+        listen=graph.machines[name].listen if name else (),
+        connect=tuple(filter(None, (graph.router,))),
+        router=graph.router,
+        insecure=graph.insecure,
+    )
     site = with_endpoint(site, listen)
-    return site if site.listen else None
+    return site if site.listen or site.router else None
 
 
 def with_endpoint(site: Site, listen: str | None) -> Site:

@@ -65,7 +65,7 @@ def check_machines(document: Document, flow: FlowShape, parts: Mapping[str, Part
             document.problem(("machines", machine), "no node runs here", key=True, warning=True)
     for name, part in parts.items():
         at = flow.machines.get(places[name] or "")
-        if part.shape.external and not (at and at.listen):
+        if part.shape.external and not (at and at.listen) and flow.router is None:
             document.problem(("nodes", name), NOBODY_LISTENS, key=True, warning=True)
     used = [machine for machine in flow.machines if machine in places.values()]
     leader = _leader(used, reached)

@@ -20,7 +20,7 @@ from caneflow.runtime.hosts.launcher.congestion import closed_in_time
 from caneflow.runtime.hosts.launcher.ends import Ends
 from caneflow.runtime.hosts.launcher.fork_server import ForkServer
 from caneflow.runtime.hosts.launcher.hearing import Ready, Said, StatusAsked, answer_status, hearing
-from caneflow.runtime.hosts.launcher.launcher_session import listening, open_launcher_session
+from caneflow.runtime.hosts.launcher.launcher_session import open_launcher_session, reached_at
 from caneflow.runtime.hosts.launcher.linking import linked
 from caneflow.runtime.hosts.launcher.node_state import NodeState
 from caneflow.runtime.hosts.launcher.nodes import LAUNCHER, Nodes
@@ -35,6 +35,7 @@ from caneflow.runtime.hosts.launcher.run_log import RunLog
 from caneflow.runtime.hosts.launcher.starting import plan_to_start, program_arguments
 from caneflow.runtime.hosts.launcher.stop_signals import Interrupted, stop_signals
 from caneflow.runtime.hosts.launcher.watcher import Watcher
+from caneflow.runtime.hosts.links.access import opened
 from caneflow.runtime.hosts.links.session import local_links
 from caneflow.runtime.outcome import Outcome, note_losses
 from caneflow.runtime.stages.merge import BEGIN
@@ -84,12 +85,13 @@ class Launcher:
 
     def run(self) -> Outcome:
         """Start everything, follow it to its end, end everything."""
+        self._deployment, settings = opened(self._deployment, self._keys)
         deployment, replay = self._deployment, self._deployment.replay
         with (
             RunDirectory(deployment.flow) as self._directory,
             local_links(deployment.links, self._directory.path) as ports,
             closed_in_time(
-                open_launcher_session(deployment, self._run, endpoint := ports.endpoint(), self._keys), [endpoint]
+                open_launcher_session(deployment, self._run, endpoint := ports.endpoint(), settings), [endpoint]
             ) as self._session,
             RunLog(self._directory.root, deployment.flow, replay=replay) as self._log,
             hearing(self._session, deployment.flow, self._events.put, progress=self._leads and replay),
@@ -102,8 +104,9 @@ class Launcher:
             self._asked = AskedRestarts(self._nodes, self._processes, self._start, self._say)
             if self._directory.remark:
                 self._say(LAUNCHER, f"{self._directory.remark}; this run is in {self._directory.path}")
-            if deployment.door is not None:
-                self._say(LAUNCHER, listening(deployment.door))
+            site = deployment.site or deployment.door
+            if site is not None and (site.listen or site.router):
+                self._say(LAUNCHER, reached_at(site, alone=deployment.site is None))
             if self._gather():
                 self._take_nodes(linked(self._deployment, ports, endpoint))
                 for node in self._nodes.here:

@@ -60,37 +60,31 @@ def secured_links(deployment: Deployment, site: Site, own: Credentials) -> dict[
     }
 
 
-def links_between(deployment: Deployment, site: Site, keys: Path | None) -> tuple[Site, dict[str, Any]]:
-    """The site with the endpoints that its launcher opens, and Zenoh's settings for them.
+def opened(deployment: Deployment, keys: Path | None) -> tuple[Deployment, dict[str, Any]]:
+    """The deployment with the endpoints that its launcher opens for others, and Zenoh's settings for them.
 
-    With keys every link between machines is mutual TLS. Raises DataflowError when a link would lead beyond this
-    computer without keys, unless the file says `insecure: true`.
+    With keys every link beyond the machine's own is mutual TLS. Without, between machines of this computer all may
+    do everything; where all nodes are on one machine, whoever comes reads, and feeds its external nodes. Raises
+    DataflowError when a link would lead beyond this computer without keys, unless the file says `insecure: true`.
     """
-    own = None if site.insecure or keys is None else credentials(keys, site.name)
-    if own is not None:
-        if deployment.records and site.name not in site.recorders:
-            raise DataflowError(f"--record: {site.name} may not read every stream; write machines.{site.name}.records")
-        behind_tls = replace(site, listen=tuple(map(tls, site.listen)), connect=tuple(map(tls, site.connect)))
-        return behind_tls, secured_links(deployment, site, own)
-    _require_keys(site, keys)
-    return site, {}
-
-
-def open_door(deployment: Deployment, keys: Path | None) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Where the only machine of a flow listens for those who only read, and Zenoh's settings for it.
-
-    With keys they show an observer's certificate. Raises DataflowError as `links_between` does.
-    """
-    site = deployment.door
+    site = deployment.site or deployment.door
     if site is None:
-        return (), {}
+        return deployment, {}
     own = None if site.insecure or keys is None or not site.name else credentials(keys, site.name)
-    if own is not None:
-        return tuple(map(tls, site.listen)), secured_links(deployment, site, own)
-    _require_keys(site, keys)
-    control = access_control(deployment, site)
-    check_access_control(control)
-    return site.listen, {"access_control": control}
+    if own is None:
+        _require_keys(site, keys)
+        if deployment.site is not None:
+            return deployment, {}
+        control = access_control(deployment, site)
+        check_access_control(control)
+        return deployment, {"access_control": control}
+    if deployment.site is not None and deployment.records and site.name not in site.recorders:
+        raise DataflowError(f"--record: {site.name} may not read every stream; write machines.{site.name}.records")
+    settings = secured_links(deployment, site, own)
+    behind_tls = replace(site, listen=tuple(map(tls, site.listen)), connect=tuple(map(tls, site.connect)))
+    if deployment.site is not None:
+        return replace(deployment, site=behind_tls), settings
+    return replace(deployment, door=behind_tls), settings
 
 
 def _require_keys(site: Site, keys: Path | None) -> None:
@@ -118,6 +112,7 @@ def access_control(deployment: Deployment, site: Site) -> dict[str, Any]:
     if site.router is not None:
         # What comes from the router is anybody's: that each machine says only what is its own, the router sees to.
         ways = list(both_ways.values())
+        ways.append(feeder_grants(deployment, site))
         both_ways[ROUTER] = (_together(comes for comes, _ in ways), _together(goes for _, goes in ways))
     control = _default_deny(both_ways)
     everything = dict.fromkeys(KINDS, _everything("*"))
@@ -140,7 +135,10 @@ def router_settings(deployment: Deployment, site: Site, own: Credentials) -> dic
         comes = [machine_grants(deployment, site, machine, other) for other in others]
         goes = [machine_grants(deployment, site, other, machine) for other in others]
         observed = observed_grants(deployment, site, machine)
-        both_ways[machine] = (_together([*comes, observed]), _together([*goes, asks]))
+        # Its external nodes show its certificate: what they write goes to it, and they hear that it reads that.
+        fed = external_keys(deployment, site, machine)
+        feeds: Grants = {"declare_subscriber": fed}
+        both_ways[machine] = (_together([*comes, observed, feeds]), _together([*goes, asks, feeds, {"put": fed}]))
     control = _default_deny(both_ways)
     check_access_control(control)
     port = site.router.rpartition(":")[2]
@@ -210,14 +208,15 @@ def observer_grants(flow: str) -> tuple[Grants, Grants]:
 def feeder_grants(deployment: Deployment, site: Site) -> tuple[Grants, Grants]:
     """An observer's rights, and to write what the external nodes of this machine do."""
     asks, gets = observer_grants(deployment.flow)
-    external = [name for name, plan in deployment.plans.items() if plan.external and _is_at(site, name)]
-    written = [sample_key(deployment.flow, name, port) for name in external for port in deployment.plans[name].outputs]
+    written = external_keys(deployment, site, site.name)
     # That somebody reads these keys is told to who writes them: without, a publisher sends nothing.
     return _together([asks, {"put": written}]), _together([gets, {"declare_subscriber": written}])
 
 
-def _is_at(site: Site, node: str) -> bool:
-    return site.places.get(node, site.name) == site.name
+def external_keys(deployment: Deployment, site: Site, machine: str) -> list[str]:
+    """The keys that the external nodes of `machine` write."""
+    plans = [plan for name, plan in deployment.plans.items() if plan.external and site.places[name] == machine]
+    return [out.key for plan in plans for out in plan.outputs.values()]
 
 
 def observed_grants(deployment: Deployment, site: Site, machine: str) -> Grants:
