@@ -12,7 +12,8 @@ import caneflow
 project = "caneflow"
 author = "the caneflow authors"
 version = release = caneflow.__version__
-extensions = ["myst_parser", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx_copybutton", "equations"]
+html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 3
 html_theme = "furo"

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import msgspec
 from typer.core import TyperArgument, TyperOption
 
 from caneflow.runtime import Operator, Sink, Source
@@ -20,11 +21,15 @@ from caneflow.words import commands
 
 ROOMS = ("operators", "drivers")
 
+# What is public, by its docstrings: these modules' `__all__`, and the families' modules. All else may change unsaid.
+PUBLIC = ("messages", "runtime", "recording", "evaluation", "attach", "testing")
+FAMILIES = ("algorithms", "simulation")
+
 
 def write(folder: Path) -> None:
-    """Write commands.md and programs.md into `folder`."""
+    """Write all pages of this kind into `folder`."""
     folder.mkdir(exist_ok=True)
-    pages = {"commands": commands_page(), "programs": programs_page()}
+    pages = {"commands": commands_page(), "programs": programs_page(), "api": api_page(), "library": library_page()}
     for name, lines in pages.items():
         text = "\n".join(lines) + "\n"
         page = folder / f"{name}.md"
@@ -61,6 +66,64 @@ def programs_page() -> Iterator[str]:
                 yield "| setting | takes | default | meaning |\n|---|---|---|---|"
                 yield from _settings(program.Settings, "")
                 yield ""
+
+
+def api_page() -> Iterator[str]:
+    """The public names of the library: what `__all__` of its modules lists, each with its signature and docstring."""
+    yield "# Python\n"
+    yield "Public names change only with a new version and a line in the changelog. What stands neither here nor on the"
+    yield "[next page](library.md) is private, whatever its name. How to use them:"
+    yield "[From Python](../how-to/python.md). Fields of messages: [messages](../messages.md).\n"
+    for name in PUBLIC:
+        module = importlib.import_module(f"caneflow.{name}")
+        yield f"## caneflow.{name}\n\n{_blocks(module.__doc__ or '')}\n"
+        for each in module.__all__:
+            yield from _entry(each, getattr(module, each))
+
+
+def library_page() -> Iterator[str]:
+    """What the families of algorithms and the simulators offer, module by module."""
+    yield "# Algorithms and simulators\n"
+    yield "Arrays and tuples in, arrays and tuples out; no message, file or clock. SI units, radians.\n"
+    for name in FAMILIES:
+        package = importlib.import_module(f"caneflow.{name}")
+        for found in pkgutil.walk_packages(package.__path__, f"caneflow.{name}."):
+            module = importlib.import_module(found.name)
+            title = "##" if found.ispkg or name == "simulation" else "###"
+            yield f"{title} {found.name.removeprefix('caneflow.')}\n\n{_blocks(module.__doc__ or '')}\n"
+            for each, value in vars(module).items():
+                if not each.startswith("_") and getattr(value, "__module__", None) == module.__name__:
+                    yield from _entry(each, value)
+
+
+def _entry(name: str, value: object) -> Iterator[str]:
+    """A class with its methods, a function, or what a plain value is."""
+    if not (inspect.isclass(value) or inspect.isfunction(value)):
+        yield f"**`{name}`**" + (f" = `{value!r}`\n" if isinstance(value, str | int | float) else "\n")
+        return
+    yield f"**`{name}{_signature(value)}`**\n\n{_blocks(_doc(value))}\n"
+    if inspect.isclass(value):
+        for method, function in vars(value).items():
+            if inspect.isfunction(function) and not method.startswith("_") and function.__doc__:
+                yield f"`{name}.{method}{_signature(function)}`\n\n{_blocks(_doc(function))}\n"
+
+
+def _doc(value: Any) -> str:
+    """A docstring; not the one that a dataclass or named tuple makes of its signature."""
+    doc = value.__doc__ or ""
+    return "" if doc.startswith(f"{value.__name__}(") else doc
+
+
+def _signature(value: Any) -> str:
+    """The parameters with their defaults: units and shapes are said in words; a message's fields have a page."""
+    if inspect.isclass(value) and issubclass(value, msgspec.Struct | Exception):
+        return ""
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):  # some classes made in C have none
+        return ""
+    plain = [each.replace(annotation=inspect.Parameter.empty) for each in signature.parameters.values()]
+    return str(signature.replace(parameters=plain, return_annotation=inspect.Signature.empty)).replace("`", "'")
 
 
 def _settings(kind: type[Any], prefix: str) -> Iterator[str]:

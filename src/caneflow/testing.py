@@ -15,6 +15,8 @@ from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.program import ANY_PORT, Context, Operator, Quiet, Source
 from caneflow.runtime.stages.operator_stage import Stage
 
+__all__ = ["Handled", "context", "run_operator", "run_source"]
+
 FLOW, NODE = "test", "tested"
 
 
