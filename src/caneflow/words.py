@@ -51,6 +51,8 @@ WORDS: dict[str, tuple[str, str]] = {
     "calibrate": ("calibrate", "Fit the rig to recordings."),
     "plot": ("plot", "Draw a recording's track and speed."),
     "view": ("view", "Show a running flow in the browser."),
+    "ros2": ("ros2", "Show a running flow to ROS 2, without ROS."),
+    "foxglove": ("foxglove", "Show a running flow, or a recording, to Foxglove."),
     "schema": ("schema", "Print the JSON Schema of a message or of a dataflow file."),
     "new": ("new", "Start a program of your own."),
     "keys": ("keys", "Make the keys of a secured flow."),

@@ -13,4 +13,7 @@ def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
     ports = plan.outputs if issubclass(program, Source) else plan.inputs
     kinds = {port: wire.kind for port, wire in ports.items()}
     random = generator(plan.seed, plan.node)
-    return program(settings, Context(node=plan.node, rig=read_rig(plan.rig), ports=kinds, random=random))
+    keys = {port: wire.key for port, wire in ports.items()}
+    rig = read_rig(plan.rig)
+    context = Context(node=plan.node, rig=rig, ports=kinds, random=random, keys=keys, replay=plan.replay)
+    return program(settings, context)

@@ -6,7 +6,7 @@ the very same class.
 
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
@@ -57,6 +57,8 @@ class Context:
     rig: Rig
     ports: Mapping[str, type[Sample]]  # what the graph wires to it (operator, sink: inputs; source: outputs)
     random: np.random.Generator  # from the graph's seed and the node's name: other nodes do not change it
+    keys: Mapping[str, str] = field(default_factory=dict)  # by the same ports: <flow>/<node>/<port> of the stream
+    replay: bool = False  # the sources are recordings: nothing may be lost, everybody waits
 
 
 class InFlow(NamedTuple):
