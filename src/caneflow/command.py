@@ -1,10 +1,12 @@
 """The door of the `caneflow` command: ready for Ctrl-C before anything that takes time to import is there."""
 
+import os
 import sys
 from typing import NoReturn
 
 from caneflow import dispatch, interrupts, standard_streams
 
+COMPLETING = "_CANEFLOW_COMPLETE"  # in the environment where a shell asks what may follow: that computes nothing
 # Words that are for their output alone: without a reader they end. The work of all others goes on.
 OUTPUT_ALONE = frozenset({"echo", "hz", "top", "info", "logs"})
 
@@ -12,7 +14,8 @@ OUTPUT_ALONE = frozenset({"echo", "hz", "top", "info", "logs"})
 def program() -> NoReturn:
     """The `caneflow` program: the command line in an interpreter whose numerical kernels are pinned."""
     interrupts.hold()  # for the interpreter that begins again
-    dispatch.restart_with_pinned_mathematics()
+    if COMPLETING not in os.environ:
+        dispatch.restart_with_pinned_mathematics()
     interrupts.end_at_once()
     main()
 

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import caneflow
-from caneflow import interrupts
+from caneflow import completion, interrupts
 from caneflow.errors import CaneflowError
 from caneflow.printable import printable
 
@@ -66,12 +66,27 @@ class Word(TyperCommand):
     def __init__(self, word: str, module: str, summary: str) -> None:
         super().__init__(word, help=summary)
         self._module = module
+        self._before: list[str] = []  # what stands between the word and the cursor
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """The context of the tool itself, to which typer hands over."""
+        """The context of the tool itself, to which typer hands over; for a shell that completes its own."""
+        if extra.get("resilient_parsing"):
+            self._before = list(args)
+            return super().make_context(info_name, [], parent, **extra)
         context = _tool(self._module).make_context(info_name, args, parent, **extra)
         interrupts.begin_work()
         return context
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """What a shell may complete: names, without the tool; else what the tool itself says, its options."""
+        # Not by name, as MISUSE: the part of click, or of typer's copy of it, that completes.
+        completing = import_module(type(ctx).__module__.rpartition(".")[0] + ".shell_completion")
+        found = completion.candidates([str(self.name), *self._before], incomplete)
+        if found is not None:
+            return [completing.CompletionItem(each) for each in found]
+        context = completing._resolve_context(_tool(self._module), {}, str(self.name), [*self._before])
+        part, incomplete = completing._resolve_incomplete(context, [*self._before], incomplete)
+        return list(part.shell_complete(context, incomplete))
 
 
 class Door(TyperGroup):
