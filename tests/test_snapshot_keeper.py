@@ -346,9 +346,9 @@ def test_a_snapshot_that_an_error_follows_is_not_gone_on_from_again(
     if kept_since:
         handle_all = host.handle_all
 
-        def keep_one_and_go_on(resumed: list[str]) -> None:
+        def keep_one_and_go_on(*, resumed: bool) -> None:
             take(host, 1)
-            handle_all(resumed)
+            handle_all(resumed=resumed)
 
         host.handle_all = keep_one_and_go_on
     with pytest.raises(ZeroDivisionError):
@@ -361,7 +361,7 @@ def test_a_node_that_started_without_keeps_its_snapshots_when_it_fails(make: Mak
     host = make()
     take(host, 0)
     with pytest.raises(ZeroDivisionError):
-        host.handle_all([])
+        host.handle_all(resumed=False)
     host.recovery["adder"].keeper.note_failure()
     assert (folder / "adder.snapshot").exists()
 

@@ -94,6 +94,10 @@ def command(
     rig: Annotated[
         Path | None, typer.Option(metavar="YAML", help="a rig to lay over the recording's and the file's")
     ] = None,
+    one_process: Annotated[
+        bool,
+        typer.Option("--one-process", help="all nodes of a machine in one process, but the recorder and a view"),
+    ] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NODE.KEY=VALUE", help="override a setting (may be given again)"),
@@ -132,6 +136,7 @@ def command(
             recorder=recorder,
             rig=_rig(rig),
             machine=None if in_process else machine,
+            one_process=one_process and not in_process,
             listen=_listen(listen, in_process=in_process),
         )
         if fork_server is not None:

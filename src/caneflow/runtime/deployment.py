@@ -31,9 +31,11 @@ from caneflow.runtime.replayed import (
 from caneflow.runtime.site import Site, door_of, site_of, with_endpoint
 from caneflow.runtime.stages.byte_budget import SENT, share
 from caneflow.runtime.user_files import place_of
+from caneflow.runtime.wording import listed
 
 RECORDER = "recorder"
 RECORDER_MODULE = "caneflow.tools.record"
+VIEW_MODULE = "caneflow.tools.view"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,11 +96,13 @@ def deploy(
     rig: dict[str, Any] | None = None,
     machine: str | None = None,
     listen: str | None = None,
+    one_process: bool = False,
 ) -> Deployment:
     """The plans of one run; raises DataflowError when the recording does not fit the graph.
 
     `recorder`: its settings beyond where it writes. `machine`: this launcher starts only what runs there; None:
-    everything. `listen`: an endpoint at which other programs may attach, beside those of the file.
+    everything. `one_process`: all nodes of a machine share one, but the recorder and a view. `listen`: an endpoint at
+    which other programs may attach, beside those of the file.
     """
     if replay and record and record.exists() and record.samefile(replay.recording):
         raise DataflowError(f"--record {record}: is the recording that is replayed; write to another file")
@@ -122,6 +126,8 @@ def deploy(
                 for name, node in nodes.items()
             }
             require_stamps(recording, replay, origin, plans)
+    if one_process:
+        plans = _in_one_process(graph, plans)
     whole_rig = overlaid(base_rig, rig or {})
     _require_rig(whole_rig, replay)  # what is wrong with a recording's rig is said before anything starts
     site = None if machine is None else site_of(graph, machine, nodes)
@@ -131,6 +137,7 @@ def deploy(
             raise DataflowError(f"--record: {machine} has no link with {min(unheard)}; record on {site.leader}")
         plan = _recorder(graph, name, plans, record, replay, whole_rig)
         plans[name] = msgspec.structs.replace(plan, settings={**plan.settings, **(recorder or {})})
+        plans = _with_recorder_in_group(plans, name, site)
         site = _with_recorder_on(site, machine) if site and machine else site
     plans = {name: _with_readers(plan, plans, whole_rig, replay is not None) for name, plan in plans.items()}
     if site is not None:
@@ -139,6 +146,28 @@ def deploy(
     door = door_of(graph, listen) if opens else None
     _require_open(graph, plans, site or door)
     return Deployment(flow=graph.flow, plans=plans, origin=origin, last=last, site=site, door=door, links=graph.links)
+
+
+def _in_one_process(graph: Graph, plans: Mapping[str, NodePlan]) -> dict[str, NodePlan]:
+    """The same with one process for each machine; raises DataflowError when their nodes restart in different ways."""
+    grouped = [name for name, plan in plans.items() if not plan.external and plan.module != VIEW_MODULE]
+    policies = {graph.nodes[name].restart: name for name in grouped}
+    if len(policies) > 1:
+        raise DataflowError(f"--one-process: {listed(policies.values())} have a `restart` each; a process has one")
+    shared = graph.flow if graph.flow not in plans or graph.flow in grouped else f"{graph.flow}_nodes"
+    return {
+        name: msgspec.structs.replace(plan, process=shared) if name in grouped else plan for name, plan in plans.items()
+    }
+
+
+def _with_recorder_in_group(plans: Mapping[str, NodePlan], recorder: str, site: Site | None) -> dict[str, NodePlan]:
+    """The same with the recorder of this machine under its own name where nodes share its process."""
+    return {
+        name: msgspec.structs.replace(plan, process=recorder)
+        if plan.process == RECORDER and (site is None or site.places[name] == site.name)
+        else plan
+        for name, plan in plans.items()
+    }
 
 
 def _require_open(graph: Graph, plans: Mapping[str, NodePlan], here: Site | None) -> None:
@@ -192,6 +221,7 @@ def _plan(graph: Graph, node: Node, nodes: dict[str, Node], left_out: LeftOutSta
     return NodePlan(
         flow=graph.flow,
         node=node.name,
+        process=node.process or "",
         module=node.module,
         file=str(node.file) if node.file else None,
         settings=node.settings_map,

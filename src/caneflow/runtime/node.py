@@ -6,14 +6,17 @@ The launcher starts `python -m <program> <plan>`; the plan says what to read, wh
 import logging
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from caneflow.runtime.building import build
+from caneflow.runtime.dataflow.programs import Located, program_at
 from caneflow.runtime.hosts.process.bus import Bus
 from caneflow.runtime.hosts.process.events import Stopped
 from caneflow.runtime.hosts.process.last_words import telling_failures
 from caneflow.runtime.hosts.process.process import Process
 from caneflow.runtime.hosts.process.sources import SourceProcess
+from caneflow.runtime.hosts.process.speaker import name_speakers
 from caneflow.runtime.plan import NodePlan, ProcessPlan
 from caneflow.runtime.program import Program, Source
 
@@ -27,21 +30,46 @@ def run(program: Program) -> None:
         path = Path(sys.argv[1])
         plan = NodePlan.read(path)
         folder = path.parent if plan.state_folder is None else Path(plan.state_folder)
-        _run(program, plan, folder / f"{plan.node}.snapshot")
+        _run({plan.node: program}, ProcessPlan.of(plan), folder / f"{plan.node}.snapshot")
     sys.exit(0)
 
 
-def _run(program: Program, plan: NodePlan, snapshots: Path) -> None:
+def run_group() -> None:
+    """Run the nodes that the plan on the command line describes; the process ends with them."""
+    logging.basicConfig(format="%(levelname)s %(message)s", level=logging.INFO, stream=sys.stderr)
+    if len(sys.argv) < 2:
+        sys.exit(f"usage: {sys.argv[0]} PLAN; a process is started by `caneflow run`")
+    name_speakers()
+    with telling_failures():
+        path = Path(sys.argv[1])
+        plan = ProcessPlan.read(path)
+        with telling_failures(building=True):
+            programs = {node.node: _program(node) for node in plan.nodes}
+        folder = plan.nodes[0].state_folder
+        _run(programs, plan, (path.parent if folder is None else Path(folder)) / f"{plan.name}.snapshot")
+    sys.exit(0)
+
+
+def _program(plan: NodePlan) -> Program:
+    name = plan.file or str(plan.module)
+    return program_at(Located(plan.module, None if plan.file is None else Path(plan.file)), name)
+
+
+def _run(programs: Mapping[str, Program], process: ProcessPlan, snapshots: Path) -> None:
     with telling_failures(building=True):
-        built = build(program, plan)
-    process = ProcessPlan.of(plan)
+        built = {name: build(programs[name], plan) for name, plan in process.members.items()}
     with Bus(process) as bus:
         signal.signal(signal.SIGINT, lambda *_: None)  # the launcher decides when a node ends
         host: SourceProcess | Process
-        if isinstance(built, Source):
-            host = SourceProcess(process, bus, built)
+        (first, *others) = built.values()
+        if isinstance(first, Source) and not others:
+            host = SourceProcess(process, bus, first)
         else:
             signal.signal(signal.SIGTERM, lambda *_: bus.put(Stopped()))
-            host = Process(process, bus, {plan.node: built}, snapshots)
+            host = Process(process, bus, built, snapshots)
         with telling_failures(at=host.at):
             host.run()
+
+
+if __name__ == "__main__":
+    run_group()

@@ -2,7 +2,7 @@
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -10,6 +10,8 @@ from caneflow.messages import SAMPLES, Sample
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.stages.byte_budget import SENT
 from caneflow.runtime.user_files import kind_at
+
+P = TypeVar("P", bound=msgspec.Struct)
 
 
 class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
@@ -67,6 +69,7 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
 
     flow: str
     node: str
+    process: str = ""  # that it shares with other nodes; "": it has one for itself
     module: str | None = None  # `python -m` name of the program
     file: str | None = None  # or a user's own file
     settings: dict[str, Any] = {}
@@ -89,6 +92,11 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
         return self.module is None and self.file is None
 
     @property
+    def runs_in(self) -> str:
+        """The name of its process."""
+        return self.process or self.node
+
+    @property
     def readers(self) -> tuple[str, ...]:
         """The nodes that read an output."""
         return tuple(dict.fromkeys(reader for out in self.outputs.values() for reader in out.readers))
@@ -100,10 +108,7 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def read(cls, path: Path) -> "NodePlan":
         """The plan in `path`; raises DataflowError when there is none."""
-        try:
-            return msgspec.json.decode(path.read_bytes(), type=cls)
-        except (OSError, msgspec.DecodeError) as error:
-            raise DataflowError(f"{path}: {error}; a node is started by `caneflow run`") from error
+        return _read(path, cls)
 
 
 class ProcessPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
@@ -111,6 +116,15 @@ class ProcessPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     name: str
     nodes: tuple[NodePlan, ...]  # at least one
+
+    def encoded(self) -> bytes:
+        """The plan as the process reads it."""
+        return msgspec.json.encode(self)
+
+    @classmethod
+    def read(cls, path: Path) -> "ProcessPlan":
+        """The plan in `path`; raises DataflowError when there is none."""
+        return _read(path, cls)
 
     @classmethod
     def of(cls, plan: NodePlan) -> "ProcessPlan":
@@ -121,6 +135,11 @@ class ProcessPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     def members(self) -> dict[str, NodePlan]:
         """The plans of its nodes by name."""
         return {plan.node: plan for plan in self.nodes}
+
+    @property
+    def is_group(self) -> bool:
+        """Whether several nodes share it."""
+        return len(self.nodes) > 1
 
     @property
     def flow(self) -> str:
@@ -150,3 +169,10 @@ class ProcessPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     def readers_outside(self, out: OutputPlan) -> tuple[str, ...]:
         """The nodes in other processes that read an output."""
         return tuple(reader for reader in out.readers if reader not in self.members)
+
+
+def _read(path: Path, kind: type[P]) -> P:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except (OSError, msgspec.DecodeError) as error:
+        raise DataflowError(f"{path}: {error}; a node is started by `caneflow run`") from error

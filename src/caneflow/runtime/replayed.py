@@ -73,6 +73,7 @@ def replayed_plan(
     return NodePlan(
         flow=graph.flow,
         node=node.name,
+        process=node.process or "",
         module=REPLAYER_MODULE,
         settings=settings,
         seed=graph.seed,

@@ -64,6 +64,7 @@ class Node:
     file: Path | None  # or to start as a file
     program: Program | None  # None: external
     machine: str | None  # None: there is only one
+    process: str | None  # that it shares with others; None: it has one for itself
     inputs: dict[str, Wire]  # in the order of the program's table, which is the order at equal stamps
     outputs: dict[str, type[Sample]]
     settings: Any  # the program's Settings, checked; None: external

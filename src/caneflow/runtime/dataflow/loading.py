@@ -7,6 +7,7 @@ from typing import Any
 
 from caneflow.messages.rig import Rig
 from caneflow.runtime.dataflow.graph import Graph, Machine, Node, Restart
+from caneflow.runtime.dataflow.process_groups import check_processes
 from caneflow.runtime.dataflow.programs import check_settings, load_program, locate, outputs_of
 from caneflow.runtime.dataflow.topology import check_machines
 from caneflow.runtime.dataflow.validation import Checked
@@ -18,7 +19,7 @@ from caneflow.runtime.program import InFlow, Operator
 from caneflow.runtime.wording import did_you_mean, listed, one_line, shown
 
 GIVEN_RIG = "rig of the recording or --rig"
-NOT_FOR_EXTERNAL = ("run", "inputs", "settings", "restart", "ready_timeout_s")
+NOT_FOR_EXTERNAL = ("run", "process", "inputs", "settings", "restart", "ready_timeout_s")
 
 
 def load(path: Path, overrides: Sequence[str] = (), *, rig: Mapping[str, Any] | None = None) -> Graph:
@@ -79,6 +80,7 @@ def _checked(document: Document, flow: FlowShape, path: Path) -> Graph | None:
             part.outputs = external_outputs(document, name, part.shape, path.parent)
     check_wires(document, flow, parts)
     layout = check_machines(document, flow, parts)
+    check_processes(document, parts, layout.places)
     nodes = {name: _node(document, name, part, layout.places[name]) for name, part in parts.items()}
     _ask_programs(document, nodes)
     if any(not problem.warning for problem in document.problems):
@@ -168,6 +170,7 @@ def _node(document: Document, name: str, part: Part, machine: str | None) -> Nod
         file=part.where.file,
         program=part.program,
         machine=machine,
+        process=shape.process,
         inputs=part.wires,
         outputs=dict(part.outputs or {}),
         settings=settings,

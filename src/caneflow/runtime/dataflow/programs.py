@@ -59,7 +59,11 @@ def available() -> list[str]:
 
 def load_program(run: str, base: Path) -> Program:
     """The one program class in what `run` names; raises DataflowError when it cannot be had."""
-    where = locate(run, base)
+    return program_at(locate(run, base), run)
+
+
+def program_at(where: Located, run: str) -> Program:
+    """The one program class there; `run`: what a person calls it. Raises DataflowError when it cannot be had."""
     module = _imported(where)
     programs = [
         value

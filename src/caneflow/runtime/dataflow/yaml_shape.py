@@ -141,6 +141,13 @@ class NodeShape(Shape):
         ),
     ]
     machine: Annotated[Name | None, Field(description="one of `machines`; needed when there are several")] = None
+    process: Annotated[
+        Name | None,
+        Field(
+            description="the process that runs it, with all nodes of its machine that say the same: samples between "
+            "them go by a call; left out: one of its own. `recorder`: the one of `--record`"
+        ),
+    ] = None
     inputs: Annotated[dict[Name, Input], Field(description="for each port of the program, what it reads")] = {}
     settings: Annotated[dict[str, Any], Field(description="the program's own; see its Settings")] = {}
     restart: Annotated[Restart, Field(default_factory=RestartShape)]

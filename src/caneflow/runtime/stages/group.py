@@ -22,8 +22,17 @@ Emitted: TypeAlias = list[tuple[str, Sample, int]]  # what a node has sent: (por
 class Group:
     """Nodes that run together: samples between them are decoded once, and never encoded for each other."""
 
-    def __init__(self, plans: Mapping[str, NodePlan], received: Callable[[str, str, Sample], int]) -> None:
-        """The members to be; `add` each. `received`: the time (ns) at which a node takes a sample on a port."""
+    def __init__(
+        self,
+        plans: Mapping[str, NodePlan],
+        received: Callable[[str, str, Sample], int],
+        working: Callable[[str], None] | None = None,
+    ) -> None:
+        """The members to be; `add` each.
+
+        `received`: the time (ns) at which a node takes a sample on a port. `working`: is told whose turn it is.
+        """
+        self._working = working
         self.feeds: dict[str, Feed] = {}
         self.readers: dict[str, Reader] = {}  # writers before their readers
         self.held: set[str] = set()  # those that handle nothing: what they have sent has to be taken first
@@ -58,24 +67,31 @@ class Group:
 
         `now` (ns) is the host's clock, given by a live host only: no stamp may lie far ahead of it.
         """
-        feed = self.feeds[node]
-        payload = feed.take(port, sample, now)
-        readers = self._wires[node, port] if payload is not None else ()
-        if payload is not None and readers:
-            try:
-                message = decode(payload, feed.outputs[port].plan.kind)
-            except MessageError as error:
-                for reader, at in readers:
-                    self.refuse(reader, at, error)
-            else:
-                self._spread(node, port, message, payload)
+        payload = self.feeds[node].take(port, sample, now)
+        if payload is not None:
+            self.deliver(node, port, payload)
         return payload
+
+    def deliver(self, node: str, port: str, payload: bytes) -> None:
+        """Hand the bytes of a source's sample, which has its number, to its local readers."""
+        readers = self._wires[node, port]
+        if not readers:
+            return
+        try:
+            message = decode(payload, self.feeds[node].outputs[port].plan.kind)
+        except MessageError as error:
+            for reader, at in readers:
+                self.refuse(reader, at, error)
+        else:
+            self._spread(node, port, message, payload)
 
     def take(
         self, node: str, port: str, message: Sample, payload: bytes | None, time: int, *, again: bool = False
     ) -> None:
         """Take a sample that came to a member at `time` (ns); `payload`: its bytes, where there are any yet."""
         self._next = 0
+        if self._working is not None:
+            self._working(node)
         reader = self.readers[node]
         if isinstance(reader, Stage):
             reader.offer(port, message, again=again)
@@ -135,6 +151,8 @@ class Group:
                 if reader.ended:
                     reader.finish()
             elif name not in self.held:
+                if self._working is not None:
+                    self._working(name)
                 if (emitted := reader.step(now)) is not None:
                     self._spread_all(name, emitted)
                     return name, emitted
@@ -143,6 +161,15 @@ class Group:
             self._next += 1
         self._next = 0
         return None
+
+    def local_ports(self, node: str) -> list[str]:
+        """The ports of a member that other members write to."""
+        return [port for port, wire in self._plans[node].inputs.items() if wire.writer in self._plans]
+
+    def readers_of(self, node: str) -> list[Reader]:
+        """The members that read what `node` sends."""
+        names = {reader for (name, _), wires in self._wires.items() if name == node for reader, _ in wires}
+        return [self.readers[name] for name in names]
 
     def finish(self) -> None:
         """End the sinks, each once."""

@@ -53,6 +53,10 @@ class Merge:
         """How many samples of `port` wait."""
         return len(self._queues[self._index[port]])
 
+    def samples(self, port: str) -> list[Sample]:
+        """Those of `port` that wait."""
+        return list(self._queues[self._index[port]])
+
     def drop_oldest(self, port: str) -> Sample:
         """Take the oldest waiting sample of `port` away."""
         return self._queues[self._index[port]].popleft()

@@ -177,6 +177,10 @@ class Stage:
             self.outputs[port].sent, self.outputs[port].last_stamp = sent, stamp
         self.finished = state.finished
 
+    def waiting(self, port: str) -> list[Sample]:
+        """The samples of `port` that have come and were not handled."""
+        return [*self._merge.samples(port), *self.inputs[port].ahead.values()]
+
     def note_packed(self, state: bytes) -> None:
         """Take note that the operator was packed just now: a sample that it cannot handle sets it back to there."""
         self._rollback.rebase(state)

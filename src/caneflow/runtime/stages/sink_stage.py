@@ -8,7 +8,9 @@ from caneflow.runtime.plan import InputPlan
 from caneflow.runtime.program import Sink
 from caneflow.runtime.stages.byte_budget import share
 from caneflow.runtime.stages.merge import BEGIN, END
+from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.streams import Arrivals
+from caneflow.runtime.wording import listed
 
 
 class Tap:
@@ -102,6 +104,20 @@ class Tap:
         taken = min(self._watermarks.values())
         confirmed = {each.plan.key: each.handled_seq for each in self.inputs.values()}
         return Progress(self.node, END if self.finished else min(taken, END - 1), {}, confirmed)
+
+    def state(self) -> dict[str, tuple[int, int]]:
+        """By port the seq and stamp (ns) of the last sample taken."""
+        return {port: (each.handled_seq, each.handled_stamp) for port, each in self.inputs.items()}
+
+    def resume(self, state: Mapping[str, tuple[int, int]]) -> None:
+        """Go on after the samples of `state`; raises SnapshotError when it is one of other ports."""
+        if self.inputs.keys() != state.keys():
+            raise SnapshotError(f"it has the inputs {listed(state)}; expected {listed(self.inputs)}")
+        for port, (seq, stamp) in state.items():
+            arrivals = self.inputs[port]
+            arrivals.handled_seq, arrivals.handled_stamp = seq, stamp
+            arrivals.expected, arrivals.last_stamp = seq + 1, stamp
+            self._advance(port, stamp)
 
     def input_counts(self) -> dict[str, InputCounts]:
         """What became of every sample that came, per port."""

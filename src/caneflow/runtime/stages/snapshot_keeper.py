@@ -4,9 +4,7 @@ A snapshot is a luxury: one that cannot be written or read is said in one line, 
 """
 
 import logging
-import os
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,12 +16,12 @@ from caneflow.runtime.stages.operator_stage import StageState
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.sent_samples import Kept
 from caneflow.runtime.stages.snapshot import pack, unpack
+from caneflow.runtime.stages.snapshot_file import SnapshotFile
 from caneflow.runtime.wording import one_line
 
 log = logging.getLogger(__name__)
 
 LAYOUT = 3  # of the file: one of another layout is not read
-OTHERS_WRITE = 0o022
 
 
 class Snapshot(msgspec.Struct, frozen=True):
@@ -45,22 +43,19 @@ class Resumed(NamedTuple):
     history: dict[str, list[Kept]]
 
 
-class SnapshotKeeper:
+class SnapshotKeeper(SnapshotFile):
     """Keeps the newest snapshot of one operator."""
 
     def __init__(self, path: Path, operator: Operator) -> None:
         """`operator`: as it was just built; its attributes are those that a snapshot must have."""
-        self._file = path.name
+        super().__init__(path)
         self._operator = operator
         self._built = set(vars(operator))
         self._module = type(operator).__module__
         self._program = f"{self._name()}:{type(operator).__qualname__}"
         self._on_trial = False  # a snapshot was gone on from, and none was kept since
-        self._failed = False  # to write one, and that was said
         self.state: bytes | None = None  # of the operator, when it was packed last
-        self._possible = True  # False: none can be taken, and that was said
-        # Held open: a folder that is removed and made again by another user gets nothing of ours, and gives nothing.
-        self._folder = self._opened(path.parent)
+        self._possible = self._folder >= 0  # False: none can be taken, and that was said
 
     def taken(self, stage: StageState, history: dict[str, list[Kept]], operator: Operator) -> bytes | None:
         """The operator's state and where its streams stand; None, said once, when the state cannot be kept."""
@@ -81,31 +76,13 @@ class SnapshotKeeper:
             Snapshot(caneflow.__version__, self._program, stage, history, state, layout=LAYOUT)
         )
 
-    def keep(self, snapshot: bytes) -> bool:
-        """Write what was taken in place of the one before; the file is whole at any moment. False: not possible now.
-
-        A folder that was removed is not made again: what stands under its name later may be another user's.
-        """
-        fresh = f"{self._file}.new"
-        try:
-            self._write(fresh, snapshot)
-            os.replace(fresh, self._file, src_dir_fd=self._folder, dst_dir_fd=self._folder)
-        except OSError as error:
-            self._remove(fresh)  # a full disk has no room for half a snapshot
-            if not self._failed:
-                log.warning(
-                    "cannot write a snapshot: %s; goes on without (tried again, not said again)", error.strerror
-                )
-            self._failed = True
-            return False
-        self._on_trial = False
-        return True
-
     def resume(self) -> Resumed | None:
         """What the newest snapshot holds; None when there is none. Raises SnapshotError for one that does not fit."""
         data = self._read()
-        if data is None:
-            return None
+        return None if data is None else self.resumed(data)
+
+    def resumed(self, data: bytes) -> Resumed:
+        """What a snapshot holds; raises SnapshotError for one that does not fit."""
         try:
             snapshot = msgspec.msgpack.decode(data, type=Snapshot)
         except Exception as error:  # it may hold anything
@@ -116,6 +93,12 @@ class SnapshotKeeper:
         if snapshot.history.keys() != snapshot.stage.outputs.keys():
             raise SnapshotError("its samples are not those of its outputs")
         return Resumed(self._unpacked(snapshot.operator), snapshot.stage, snapshot.history)
+
+    def keep(self, snapshot: bytes) -> bool:
+        """Write what was taken in place of the one before. False: not possible now."""
+        kept = super().keep(snapshot)
+        self._on_trial = self._on_trial and not kept
+        return kept
 
     def go_on_with(self, operator: Operator) -> None:
         """Note that a snapshot's operator is used from now on."""
@@ -129,10 +112,6 @@ class SnapshotKeeper:
             self.discard()
             log.warning("failed after it had gone on from its snapshot; that one is not used again")
 
-    def discard(self) -> None:
-        """Remove the newest snapshot, if there is one."""
-        self._remove(self._file)
-
     def _unpacked(self, state: bytes) -> Operator:
         operator = unpack(state, self._module)
         if type(operator) is not type(self._operator):
@@ -140,44 +119,6 @@ class SnapshotKeeper:
         if missing := self._built - vars(operator).keys():
             raise SnapshotError(f"it lacks the attribute {min(missing)}")
         return operator
-
-    def _opened(self, folder: Path) -> int:
-        """A descriptor of the folder, if nobody else can write to it; -1, said once, when that is not so."""
-        descriptor = -1
-        try:
-            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-            about = os.fstat(descriptor)
-            if about.st_uid == os.geteuid() and not about.st_mode & OTHERS_WRITE:
-                return descriptor
-            os.close(descriptor)
-            found = "others can write to it; expected a folder of this user's alone"
-        except OSError as error:
-            found = str(error.strerror)
-        self._possible = False
-        log.warning("keeps no snapshots: %s: %s", folder, found)
-        return -1
-
-    def _read(self) -> bytes | None:
-        if self._folder < 0:
-            return None
-        try:
-            flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
-            with os.fdopen(os.open(self._file, flags, dir_fd=self._folder), "rb") as file:
-                return file.read()
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise SnapshotError(f"it cannot be read: {error.strerror}") from error
-
-    def _write(self, name: str, data: bytes) -> None:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW
-        with os.fdopen(os.open(name, flags, 0o600, dir_fd=self._folder), "wb") as file:
-            file.write(data)
-
-    def _remove(self, name: str) -> None:
-        if self._folder >= 0:
-            with suppress(OSError):  # it is not there
-                os.unlink(name, dir_fd=self._folder)
 
     def _name(self) -> str:
         """The program's module by its own name, also where it runs as a script."""

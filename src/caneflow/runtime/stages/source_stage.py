@@ -3,15 +3,26 @@
 import logging
 from collections.abc import Mapping
 
+import msgspec
+
 from caneflow.messages import MessageError, Sample, decode, numbered
 from caneflow.messages.control import PortMark, Progress
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import OutputPlan
 from caneflow.runtime.program import Encoded
 from caneflow.runtime.stages.merge import BEGIN, END
+from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.streams import FAR_AHEAD, Departures, lies_ahead
+from caneflow.runtime.wording import listed
 
 log = logging.getLogger(__name__)
+
+
+class FeedState(msgspec.Struct, frozen=True):
+    """Where the streams of a source stand."""
+
+    outputs: dict[str, tuple[int, int]]  # by port how many were sent, and the last one's stamp (ns)
+    quiet: int  # ns: nothing with a stamp at or before it will be brought
 
 
 class Feed:
@@ -64,6 +75,18 @@ class Feed:
             for port, out in self.outputs.items()
         }
         return Progress(self.node, min((mark.watermark for mark in marks.values()), default=END), marks)
+
+    def state(self) -> FeedState:
+        """Where the streams stand."""
+        return FeedState({port: (out.sent, out.last_stamp) for port, out in self.outputs.items()}, self._quiet)
+
+    def resume(self, state: FeedState) -> None:
+        """Go on where `state` was taken; raises SnapshotError when it is one of other ports."""
+        if self.outputs.keys() != state.outputs.keys():
+            raise SnapshotError(f"it has the outputs {listed(state.outputs)}; expected {listed(self.outputs)}")
+        for port, (sent, stamp) in state.outputs.items():
+            self.outputs[port].sent, self.outputs[port].last_stamp = sent, stamp
+        self._quiet = state.quiet
 
     def _payload(self, departures: Departures, sample: Sample | Encoded) -> bytes | None:
         """The sample's bytes under its number in this run: a recording may begin in the middle, or have gaps."""

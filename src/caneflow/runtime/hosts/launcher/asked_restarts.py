@@ -42,9 +42,10 @@ class AskedRestarts:
         if (refusal := self._refusal(asked.node, replay=replay)) is not None:
             asked.answer(refusal)
             return
-        node = self._nodes[asked.node]
-        self._waiting.setdefault(asked.node, []).append(asked)
-        if asked.node in self._kill_at:
+        node = self._nodes.head_of(asked.node)
+        name = node.plan.node  # of the first node of its process, which starts again as a whole
+        self._waiting.setdefault(name, []).append(asked)
+        if name in self._kill_at:
             return  # it is ending already
         node.policy.asked(time.monotonic())
         if node.state == "waiting":
@@ -52,8 +53,8 @@ class AskedRestarts:
             return
         self._say(asked.node, "restart: somebody asked for it")
         node.state = "ending"
-        self._kill_at[asked.node] = time.monotonic() + END_PATIENCE
-        self._processes.ask_to_end(asked.node)
+        self._kill_at[name] = time.monotonic() + END_PATIENCE
+        self._processes.ask_to_end(name)
 
     def ended(self, exited: Exited) -> bool:
         """Whether the process ended because it was asked to; then the node starts again."""

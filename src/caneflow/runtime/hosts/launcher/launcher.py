@@ -109,7 +109,7 @@ class Launcher:
                 self._say(LAUNCHER, reached_at(site, alone=deployment.site is None))
             if self._gather():
                 self._take_nodes(linked(self._deployment, ports, endpoint))
-                for node in self._nodes.here:
+                for node in self._nodes.heads:
                     self._start(node)
                 self._follow()
             if self._companions is not None:
@@ -178,6 +178,7 @@ class Launcher:
             self._look_at_folder()
             self._look_at_deadlines()
             self._asked.look()
+            self._nodes.follow_heads()
             self._open_window()
             if self._clocks is not None:
                 self._clocks.look()
@@ -249,19 +250,23 @@ class Launcher:
             cause = f"cannot be started: the run's folder {folder}, where its links would be, was removed"
             self._end(node, cause, How.LASTING)
             return
+        members = self._nodes.members(node)
+        readers = [reader for each in members for reader in each.plan.readers]
         plan = plan_to_start(
-            node,
+            members,
             run=self._run,
             state=self._state_folder.path if self._state_folder else folder,
             spares=self._nodes.spares,
-            out_of_reach=self._companions.out_of_reach(node.plan.readers) if self._companions else (),
+            out_of_reach=self._companions.out_of_reach(readers) if self._companions else (),
             started_s=self._started_s,
         )
-        node.state, node.last_words = "starting", None
-        node.started_at = time.monotonic()
+        node.last_words = None
+        for each in members:
+            each.state, each.started_at = "starting", time.monotonic()
         try:
-            arguments, called = program_arguments(plan), folder / f"{plan.node}.json"
-            node.pid = self._processes.start(plan.node, arguments, plan.encoded(), called)
+            arguments, called = program_arguments(plan), folder / f"{plan.name}.json"
+            encoded = plan.encoded() if len(members) > 1 else plan.nodes[0].encoded()
+            node.pid = self._processes.start(node.plan.node, arguments, encoded, called)
         except OSError as error:
             self._end(node, f"cannot be started: {error.strerror}", How.STOPPED)
 
@@ -285,10 +290,11 @@ class Launcher:
         alone_since = self._companions.alone_since if self._companions else None
         if self._deployment.replay and alone_since and now - alone_since > LEADER_PATIENCE:
             self._outcome.failures.append(f"the leading machine has not come back for {LEADER_PATIENCE:g} s")
-        for node in self._nodes.here:
+        for node in self._nodes.heads:
+            starting = [each for each in self._nodes.members(node) if each.state == "starting"]
             if node.state == "waiting" and now >= node.restart_at:
                 self._start(node)
-            elif node.state == "starting" and now - node.started_at > node.plan.ready_timeout_s:
+            elif any(now - each.started_at > each.plan.ready_timeout_s for each in starting):
                 self._processes.kill(node.plan.node)
                 pid, node.pid = node.pid, 0  # its exit is told here
                 self._end(node, f"not ready after {node.plan.ready_timeout_s:g} s (pid {pid} killed)", How.STOPPED)

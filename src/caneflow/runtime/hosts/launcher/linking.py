@@ -1,5 +1,6 @@
 """Who listens and who dials, by process."""
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import msgspec
@@ -13,15 +14,30 @@ from caneflow.runtime.site import Site
 def linked(deployment: Deployment, ports: Ports | Sockets, launcher: str) -> Deployment:
     """The same with an endpoint for every writer here: readers dial writers, everybody dials the launcher."""
     here = {name: plan for name, plan in deployment.plans.items() if deployment.runs_here(name)}
-    endpoints = {name: ports.endpoint() for name, plan in here.items() if any(map(here.get, plan.readers))}
+    process = {name: plan.runs_in for name, plan in here.items()}
+    wires = {  # between processes: who is read, by whom; in the order of the file
+        (process[name], process[reader]): None
+        for name, plan in here.items()
+        for reader in plan.readers
+        if reader in here and process[reader] != process[name]
+    }
+    endpoints = {writer: ports.endpoint() for writer in dict.fromkeys(writer for writer, _ in wires)}
+    links = {}
+    for reader in dict.fromkeys(process.values()):
+        # Of two processes that read each other, one dials.
+        dialled = [writer for writer, by in wires if by == reader and not _dials(wires, writer, reader)]
+        connect = (launcher, *(endpoints[writer] for writer in dialled))
+        links[reader] = Links(listen=(endpoints[reader],) if reader in endpoints else (), connect=connect)
     plans = dict(deployment.plans)
     for name, plan in here.items():
-        writers = dict.fromkeys(wire.writer for wire in plan.inputs.values())
-        connect = (launcher, *(endpoints[writer] for writer in writers if writer in endpoints))
-        listen = (endpoints[name],) if name in endpoints else ()
-        plan = msgspec.structs.replace(plan, links=Links(listen=listen, connect=connect))
+        plan = msgspec.structs.replace(plan, links=links[process[name]])
         plans[name] = _with_clocks(plan, deployment.site) if deployment.site else plan
     return replace(deployment, plans=plans)
+
+
+def _dials(wires: Collection[tuple[str, str]], one: str, other: str) -> bool:
+    """Whether `one` is the one of two that read each other which dials."""
+    return (other, one) in wires and (one, other) in wires and one < other
 
 
 def _with_clocks(plan: NodePlan, site: Site) -> NodePlan:

@@ -13,6 +13,7 @@ from caneflow.runtime.hosts.launcher.node_state import NodeState
 from caneflow.runtime.hosts.launcher.node_statistics import NodeStatistics
 from caneflow.runtime.hosts.launcher.restarts import Restarts
 from caneflow.runtime.hosts.launcher.watcher import Say
+from caneflow.runtime.hosts.process.speaker import spoken
 from caneflow.runtime.stages.merge import END
 
 LAUNCHER = "caneflow"  # the launcher's name in the merged log
@@ -24,6 +25,7 @@ class Nodes:
     def __init__(self, say: Say) -> None:
         self._say = say
         self._nodes: dict[str, NodeState] = {}
+        self._processes: dict[str, list[NodeState]] = {}  # of those here, by the first node of each
         self._statistics = NodeStatistics()
 
     def take(self, deployment: Deployment, restarts: Mapping[str, Restart], *, leads: bool) -> None:
@@ -33,9 +35,13 @@ class Nodes:
             if leads or here:
                 recorder = RECORDER_RESTART if deployment.replay else LIVE_RECORDER_RESTART
                 policy = Restarts(restarts.get(name, recorder), replay=deployment.replay)
-                spare = plan.module == RECORDER_MODULE and not deployment.replay
+                alone = sum(other.runs_in == plan.runs_in for other in deployment.plans.values()) == 1
+                spare = plan.module == RECORDER_MODULE and not deployment.replay and alone
                 state = "external" if plan.external else "starting"
                 self._nodes[name] = NodeState(plan, policy, spare=spare, here=here, state=state)
+        first: dict[str, str] = {}
+        for node in self.here:
+            self._processes.setdefault(first.setdefault(node.plan.runs_in, node.plan.node), []).append(node)
 
     def __getitem__(self, name: str) -> NodeState:
         return self._nodes[name]
@@ -50,6 +56,27 @@ class Nodes:
     def here(self) -> list[NodeState]:
         """Those that this launcher starts."""
         return [node for node in self if node.here and not node.plan.external]
+
+    @property
+    def heads(self) -> list[NodeState]:
+        """The first node of each process that this launcher starts: what is known of the process is noted there."""
+        return [members[0] for members in self._processes.values()]
+
+    def head_of(self, name: str) -> NodeState:
+        """The first node of the process that runs the node `name`."""
+        return next((members[0] for members in self._processes.values() if self[name] in members), self[name])
+
+    def members(self, head: NodeState) -> list[NodeState]:
+        """All nodes of the process whose first one is `head`."""
+        return self._processes[head.plan.node]
+
+    def follow_heads(self) -> None:
+        """Note with each node what has become of its process."""
+        for head, *others in self._processes.values():
+            for node in others:
+                node.pid, node.restarts, node.asked = head.pid, head.restarts, head.asked
+                if head.state in ("ending", "waiting", "failed"):
+                    node.state, node.restart_at = head.state, head.restart_at
 
     @property
     def spares(self) -> list[str]:
@@ -76,10 +103,15 @@ class Nodes:
 
     @property
     def kinds(self) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
-        """The names of sources, operators and sinks, but for external nodes."""
-        sources = [node.plan.node for node in self if not (node.plan.inputs or node.plan.external)]
-        sinks = [node.plan.node for node in self if node.plan.inputs and not node.plan.outputs]
-        operators = [node.plan.node for node in self if node.plan.inputs and node.plan.outputs]
+        """The processes here, by their first nodes: with sources alone, with operators, with sinks."""
+        sources, operators, sinks = [], [], []
+        for head, members in self._processes.items():
+            if any(node.plan.inputs and not node.plan.outputs for node in members):
+                sinks.append(head)
+            elif any(node.plan.inputs for node in members):
+                operators.append(head)
+            else:
+                sources.append(head)
         return sources, operators, sinks
 
     @property
@@ -92,8 +124,12 @@ class Nodes:
         if name not in self:
             self._say(name, text)
             return
-        for line, level in self[name].take_line(text):
-            self._say(name, line, level)
+        head = self[name]
+        speaker, text = spoken(text)
+        node = self._nodes.get(speaker, head)
+        for line, level in head.take_line(text):
+            self._say(node.plan.node, line, level)
+        node.last_line = head.last_line
 
     def take_said(self, said: Said) -> None:
         """Note what a node says of its progress, or of what it counted."""
@@ -127,7 +163,8 @@ class Nodes:
             return
         node.state = "ready"
         now = time.monotonic()
-        node.policy.ready(now)
+        if all(member.state == "ready" for member in self._processes.get(name, ())):
+            node.policy.ready(now)
         if node.failing_since is not None:
             self._say(name, f"is there again, after {now - node.failing_since:.1f} s")
             node.failing_since = None

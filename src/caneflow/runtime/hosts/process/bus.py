@@ -35,7 +35,9 @@ from caneflow.runtime.stages.byte_budget import CONTROL, INBOX, share
 
 log = logging.getLogger(__name__)
 
-Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken"
+Held: TypeAlias = (
+    "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken | zenoh.MatchingListener[None]"
+)
 
 ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
@@ -69,6 +71,10 @@ class Bus:
             for node in plan.nodes
             for port, out in node.outputs.items()
         }
+        # Ports whose samples go out: all, but in a group those that only members read, while nobody else listens.
+        self._heard = set(self._publishers)
+        if plan.is_group:
+            self._watch_listeners()
         self._words = {
             (word, node): self._control_publisher(word, node)
             for node in plan.members
@@ -178,6 +184,10 @@ class Bus:
             else:
                 query.reply(query.key_expr, answer)
 
+    def is_heard(self, node: str, port: str) -> bool:
+        """Whether anybody outside may hear what is sent on an output port."""
+        return (node, port) in self._heard
+
     def send(self, node: str, port: str, payload: bytes) -> None:
         """Publish a sample's bytes on a node's output port."""
         if self._is_timed():  # beside the sample, whose bytes are the recording's
@@ -285,6 +295,17 @@ class Bus:
             congestion_control=zenoh.CongestionControl.BLOCK if replay else zenoh.CongestionControl.DROP,
             express=not replay,  # live: the newest sample at once; replay: throughput
         )
+
+    def _watch_listeners(self) -> None:
+        """Follow whether tools listen to what only members read."""
+        for node in self._plan.nodes:
+            for port, out in node.outputs.items():
+                if not self._plan.readers_outside(out):
+                    at = (node.node, port)
+                    self._heard.discard(at)
+                    watch = callbacks.on_matching(partial(self._heard.add, at), partial(self._heard.discard, at))
+                    handler = zenoh.handlers.Callback(watch, indirect=False)
+                    self._held.append(self._publishers[at].declare_matching_listener(handler))
 
     def _control_publisher(self, *parts: str) -> zenoh.Publisher:
         return self._session.declare_publisher(

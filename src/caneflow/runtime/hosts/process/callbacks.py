@@ -137,6 +137,11 @@ def on_window(put: Put) -> Callable[[zenoh.Sample], None]:
     return take
 
 
+def on_matching(begin: Callable[[], None], end: Callable[[], None]) -> Callable[[zenoh.MatchingStatus], None]:
+    """That somebody listens to a stream, or nobody any more."""
+    return lambda status: begin() if status.matching else end()
+
+
 def say_yes(key: str) -> Callable[[zenoh.Query], None]:
     """Answer whoever asks on `key`."""
 

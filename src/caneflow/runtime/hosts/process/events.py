@@ -5,7 +5,9 @@ from typing import TypeAlias
 import msgspec
 import zenoh
 
+from caneflow.messages import Sample
 from caneflow.messages.control import Clock, PortMark
+from caneflow.runtime.program import Encoded
 from caneflow.runtime.stages.byte_budget import PER_REQUEST, PER_SAMPLE
 
 
@@ -84,6 +86,14 @@ class Timed(msgspec.Struct, frozen=True, gc=False):
     clock: Clock
 
 
+class Brought(msgspec.Struct, frozen=True, gc=False):
+    """What a source of this process has brought, while that is not quick."""
+
+    node: str
+    port: str
+    sample: Sample | Encoded
+
+
 class Broken(msgspec.Struct, frozen=True, gc=False):
     """Something was raised while an event was taken at once: it belongs to the node's own thread."""
 
@@ -114,6 +124,7 @@ Event: TypeAlias = (
     | LeftOutNoted
     | Marked
     | Timed
+    | Brought
     | Broken
     | Started
     | Opened

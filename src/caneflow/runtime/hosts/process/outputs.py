@@ -15,7 +15,12 @@ class Outputs:
     def __init__(self, plan: NodePlan, process: ProcessPlan, bus: Bus) -> None:
         self._node = plan.node
         self._bus = bus
+        # Some outside wait for a mark of this node's.
+        self.awaited = any(
+            out.awaited and (process.readers_outside(out) or not process.is_group) for out in plan.outputs.values()
+        )
         readers = {port: process.readers_outside(out) for port, out in plan.outputs.items()}
+        self._read = {port for port, names in readers.items() if names or not process.is_group}
         # In a replay it waits while what it has sent is too much, live it forgets the oldest.
         budgets = {port: out.budget for port, out in plan.outputs.items()}
         self.history = History(readers, budgets, waits=plan.replay)
@@ -28,8 +33,13 @@ class Outputs:
     def send(self, emitted: Emitted) -> None:
         """Send what an operator has emitted."""
         for port, message, seq in emitted:
-            payload = numbered(message, seq)
-            self.history.keep(port, seq, payload)
+            if port in self._read or self._bus.is_heard(self._node, port):
+                self.send_encoded(port, seq, numbered(message, seq))
+
+    def send_encoded(self, port: str, seq: int, payload: bytes) -> None:
+        """Send a sample that has its bytes."""
+        self.history.keep(port, seq, payload)
+        if port in self._read or self._bus.is_heard(self._node, port):
             self._bus.send(self._node, port, payload)
 
     def send_again(self) -> None:

@@ -1,14 +1,16 @@
-"""What a process needs to continue after a kill, and when it is written."""
+"""What a process of one operator needs to continue after a kill, and when it is written."""
 
 import logging
 import math
 import time
+from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from caneflow.runtime.hosts.process.outputs import Outputs
 from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.stages.byte_budget import weight
+from caneflow.runtime.stages.journal import Brought
 from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
@@ -86,6 +88,17 @@ class Recovery:
                 self._outputs.history.keep(port, seq, payload)
         self.confirmed = {self._plan.inputs[port].key: seq for port, (seq, _) in kept.stage.inputs.items()}
         return True
+
+    def confirmed_by(self, node: str) -> dict[str, int]:
+        """By input key the last seq that will not be asked for again."""
+        return self.confirmed
+
+    def keep_brought(self, brought: Brought) -> None:
+        """Nothing: there is no source here."""
+
+    def brought_since(self) -> Iterable[Brought]:
+        """Nothing, likewise."""
+        return ()
 
     def note_failure(self) -> None:
         """Note that the process ends with an error."""
