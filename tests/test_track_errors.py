@@ -229,3 +229,26 @@ def test_agrees_with_the_outside_check_to_its_rounding(
     for name in ("final_distance", "final_error", "ate", "extent"):
         assert getattr(errors, name) == pytest.approx(expected[name], abs=0.00051), name
     assert errors.drift_percent == pytest.approx(expected["drift_percent"], abs=0.0051)
+
+
+def test_a_scale_of_two_per_cent_draws_a_fixed_point_two_per_cent_of_the_way_off() -> None:
+    true = straight(20.0, 2001)  # 1 m/s, straight
+    errors = track_errors(track(true * 1.02), track(true))
+    assert errors.local_1s == pytest.approx(0.02, abs=1e-3)
+    assert errors.local_5s == pytest.approx(0.10, abs=1e-3)
+
+
+def test_a_drift_of_the_heading_turns_the_point_about_the_walker() -> None:
+    still = np.zeros((2001, 2))
+    drift = np.linspace(0.0, 0.2, 2001)  # rad, 0.01 rad/s at rest
+    errors = track_errors(track(still, drift), track(still))
+    assert errors.local_1s == pytest.approx(2.0 * 0.01, rel=1e-3)
+    assert errors.local_5s == pytest.approx(2.0 * 2.0 * math.sin(0.025), rel=1e-3)
+
+
+def test_what_is_only_turned_or_shifted_draws_every_point_in_one_place() -> None:
+    true = loop()
+    errors = track_errors(track(turned(true, 0.7) + 3.0, 0.7), track(true))
+    assert errors.local_1s == pytest.approx(0.0, abs=1e-9)
+    assert errors.local_5s == pytest.approx(0.0, abs=1e-9)
+    assert track_errors(track(straight(1.0, 101)), track(straight(1.0, 101))).local_5s is None

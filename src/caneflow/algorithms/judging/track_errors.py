@@ -16,6 +16,8 @@ Stamps: TypeAlias = NDArray[np.int64]
 
 START_NS = 500_000_000  # the yaw at the start is the mean of this long
 LARGEST_MISS_NS = 1_000_000_000  # a track that starts later or ends earlier than the truth by this is no track
+LOCAL_DISTANCE = 2.0  # m ahead, of the point that is drawn again
+LOCAL_QUANTILE = 0.95
 RELATIVE_LENGTH = 1.0  # m of truth's path over which the relative error is taken
 
 
@@ -34,6 +36,8 @@ class TrackErrors:
     path_length_ratio: float | None  # length of the estimate's path over that of the truth: shows a constant scale
     extent: float | None  # longer side of the estimate's bounding box over that of the truth
     growth_rate: float  # m/s, final_distance over duration, as in Table I
+    local_1s: float | None = None  # m, 95 % quantile: how far off a point LOCAL_DISTANCE away is drawn 1 s after it was
+    local_5s: float | None = None  # m, the same after 5 s: what a map of the surroundings rests on
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +96,8 @@ def track_errors(estimate: Track, truth: Track, *, boresight: Vector = (0.0, 1.0
         path_length_ratio=_ratio(path_length(track), length),
         extent=_ratio(float(np.ptp(track, axis=0).max()), float(np.ptp(path, axis=0).max())),
         growth_rate=final_distance / duration,
+        local_1s=local_error(times, track, path, yaw, heading_error, 1.0),
+        local_5s=local_error(times, track, path, yaw, heading_error, 5.0),
     )
 
 
@@ -147,6 +153,27 @@ def relative_error(track: Floats, path: Floats, heading_error: Floats, length: f
     moved = _turned(track[ends] - track[starts], -heading_error[starts])
     errors = moved - (path[ends] - path[starts])
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def local_error(
+    times: Floats, track: Floats, path: Floats, yaw: Floats, heading_error: Floats, after: float
+) -> float | None:
+    """How far (m) from its first place a fixed point is drawn `after` s later, LOCAL_QUANTILE over all poses.
+
+    `track` and `path` (n, 2) m are the estimated and true places at `times` (n,) s, `yaw` the estimated one and
+    `heading_error` that less the true one, (n,) rad. The point lies LOCAL_DISTANCE ahead of the true place at first; it
+    is drawn where an estimate puts what a faultless sensor sees. None when the track is shorter.
+    """
+    ends = np.searchsorted(times, times + after)
+    starts = np.flatnonzero(ends < len(times))
+    if not len(starts):
+        return None
+    ends = ends[starts]
+    true_yaw = (yaw - heading_error)[starts]
+    ahead = LOCAL_DISTANCE * np.stack([np.cos(true_yaw), np.sin(true_yaw)], axis=1)
+    first = track[starts] + _turned(ahead, heading_error[starts])
+    again = track[ends] + _turned(path[starts] + ahead - path[ends], heading_error[ends])
+    return float(np.quantile(np.linalg.norm(again - first, axis=1), LOCAL_QUANTILE))
 
 
 def _require_cover(stamps: Stamps, truth: Stamps) -> None:
