@@ -1,6 +1,7 @@
 """A node that is somebody else's program: it dials the flow, feeds it, is counted, goes and comes back."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ import msgpack
 import pytest
 import zenoh
 
-from caneflow.messages import control_key, decode
+from caneflow.messages import Imu, control_key, decode
 from caneflow.messages.control import FlowStatus
 from caneflow.recording import Recording
 from tests.flows import CANEFLOW, Launched, free_port, launchers, wait_for
@@ -100,6 +101,7 @@ def test_its_samples_reach_the_reader_and_the_recording_byte_for_byte(
         assert [each.payload for each in recording.samples([("imu", "imu")])] == sent
         assert recording.streams["attitude", "imu"].count == 50
     assert "restart" not in running.said
+    assert "warning" not in running.said, "it does listen"
 
 
 def test_it_is_counted_goes_and_comes_back(launch: Callable[..., Launched], tmp_path: Path) -> None:
@@ -187,5 +189,73 @@ def test_the_examples_of_the_page_feed_and_hear(launch: Callable[..., Launched],
     lines = [json.loads(line) for line in printed.splitlines()]
     assert len(lines) == 20
     assert all(abs(sum(part * part for part in line) - 1.0) < 1e-6 for line in lines)
+    running.process.terminate()
+    assert running.ends() == 130
+
+
+PICO = """
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+typedef int z_owned_config_t, z_owned_session_t, z_view_keyexpr_t;
+typedef struct { const uint8_t *data; size_t size; } z_owned_bytes_t;
+#define Z_CONFIG_MODE_KEY 1
+#define Z_CONFIG_CONNECT_KEY 2
+#define z_loan(x) (&(x))
+#define z_loan_mut(x) (&(x))
+#define z_move(x) (&(x))
+#define z_drop(x) (void)(x)
+#define z_config_default(config) (*(config) = 0)
+#define zp_config_insert(config, key, value) (printf("%d %s\\n", key, value))
+#define z_open(session, config, options) (*(session) = 0)
+#define zp_start_read_task(session, options) (void)(session)
+#define zp_start_lease_task(session, options) (void)(session)
+#define z_view_keyexpr_from_str(key, text) (*(key) = 0, puts(text))
+#define z_bytes_copy_from_buf(bytes, from, length) ((bytes)->data = (from), (bytes)->size = (length))
+#define z_put(session, key, bytes, options) put(bytes)
+#define z_sleep_ms(duration) (void)(duration)
+static void put(const z_owned_bytes_t *bytes) {
+    for (size_t i = 0; i < bytes->size; i++) printf("%02x", bytes->data[i]);
+    puts("");
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_c_example_writes_samples_of_the_wire(tmp_path: Path) -> None:
+    """Against a stand-in for zenoh-pico that prints what is put."""
+    (tmp_path / "zenoh-pico.h").write_text(PICO)
+    source = Path(__file__).parent.parent / "examples" / "feed_imu.c"
+    flags = ["-std=c11", "-Wall", "-Wno-unused-variable", "-Wno-unused-but-set-variable", "-Werror"]
+    subprocess.run(["cc", *flags, f"-I{tmp_path}", source, "-o", tmp_path / "feed"], check=True)
+    said = subprocess.run([tmp_path / "feed", "tcp/a:1", "f/imu/imu", "3"], capture_output=True, text=True, check=True)
+    mode, endpoint, key, *payloads = said.stdout.splitlines()
+    assert (mode, endpoint, key) == ("1 client", "2 tcp/a:1", "f/imu/imu")
+    samples = [decode(bytes.fromhex(payload), Imu) for payload in payloads]
+    assert [(each.seq, each.gyro, each.accel) for each in samples] == [(n, (0, 0, 0.1), (0, 0, 9.81)) for n in range(3)]
+    assert abs(samples[0].stamp - time.time_ns()) < 60 * 10**9, "s since then"
+
+
+def zenoh_pico() -> list[str]:
+    """What a compiler needs for zenoh-pico; skips where there is none."""
+    if shutil.which("cc") is None or shutil.which("pkg-config") is None:
+        pytest.skip("no C compiler with pkg-config here")
+    found = subprocess.run(
+        ["pkg-config", "--cflags", "--libs", "zenohpico"], capture_output=True, text=True, check=False
+    )
+    if found.returncode:
+        pytest.skip("no zenoh-pico here: pkg-config does not know zenohpico, and no package index has it")
+    return found.stdout.split()
+
+
+def test_the_c_example_feeds_a_flow(launch: Callable[..., Launched], tmp_path: Path) -> None:
+    libraries = zenoh_pico()
+    source = Path(__file__).parent.parent / "examples" / "feed_imu.c"
+    subprocess.run(["cc", "-std=c11", source, *libraries, "-o", tmp_path / "feed"], check=True)
+    running, flow, at = began(launch, tmp_path)
+    with client(at) as session:
+        wait_for(lambda: {n.state for n in status(session, flow).nodes} == {"external", "ready"}, "the others")
+        subprocess.run([tmp_path / "feed", at, f"{flow}/imu/imu", "100"], check=True)
+        wait_for(lambda: handled(session, flow) == 100, "all to be handled")
     running.process.terminate()
     assert running.ends() == 130

@@ -19,6 +19,7 @@ from caneflow.printable import printable
 from caneflow.recording.parts import Rotation, read_span
 from caneflow.runtime.dataflow.graph import Graph
 from caneflow.runtime.dataflow.loading import load, read_rig
+from caneflow.runtime.dataflow.topology import NOBODY_LISTENS
 from caneflow.runtime.deployment import Deployment, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
@@ -123,7 +124,8 @@ def command(
     ):
         graph = load(file, settings or ())
         for warning in graph.warnings:
-            print(warning, file=sys.stderr)
+            if NOBODY_LISTENS not in warning or not (listen or replay):  # --listen does, a recording stands in for it
+                print(warning, file=sys.stderr)
         if record is not None:
             require_no_input(record, [node.file for node in graph.nodes.values()])
         speed = speed or ("max" if in_process else "1")

@@ -85,7 +85,7 @@ class MachineShape(Shape):
 
     listen: Annotated[
         list[Endpoint],
-        Field(description="where other machines reach it; where it is the only machine, programs that only read"),
+        Field(description="where other machines reach it, and programs that read, or that are its external nodes"),
     ] = []
     connect: Annotated[
         list[Endpoint], Field(description="whom it dials: for each pair of machines, one of the two does")
@@ -185,7 +185,10 @@ class FlowShape(Shape):
     machines: Annotated[dict[Name, MachineShape], Field(description="when the flow runs on several computers")] = {}
     router: Annotated[
         Endpoint | None,
-        Field(description="a Zenoh router (zenohd) that every machine dials; they need no links with each other then"),
+        Field(
+            description="a Zenoh router (zenohd) that every machine dials, also a single one; several need no "
+            "links with each other then"
+        ),
     ] = None
     links: Annotated[
         LocalLinks,
