@@ -1,7 +1,7 @@
 """Position by dead reckoning: the radar's speed over ground along the IMU's heading, by the method of choice.
 
 in   imu   : Imu          orientation, linear acceleration, gyro, 100 Hz
-in   speed : GroundSpeed  one per radar frame, 100 Hz
+in   speed : GroundSpeed  one per radar frame, 100 Hz; not wired: shs and naive_ins work without
 out  pose  : Pose         one per IMU sample
 """
 
@@ -19,12 +19,13 @@ from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettin
 from caneflow.algorithms.glitches import GlitchGate, Readings
 from caneflow.algorithms.inertial.imu_sample import require_later, required_acceleration, required_orientation
 from caneflow.algorithms.radar.ground_velocity import UNOBSERVED
-from caneflow.messages import GroundSpeed, Imu, Pose, Sample
+from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 
 Method: TypeAlias = Literal["luenberger", "luenberger_fixed", "kalman", "shs", "naive_ins", "best"]
+WITHOUT_SPEED = ("shs", "naive_ins")  # methods that an IMU alone is enough for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +50,15 @@ class Fusion(Operator):
 
     inputs = {"imu": Imu, "speed": GroundSpeed}
     outputs = {"pose": Pose}
+    optional_inputs = frozenset({"speed"})  # of a graph without radar, for methods that need none
     Settings = FusionSettings
 
     def __init__(self, settings: FusionSettings, context: Context) -> None:
+        if settings.method not in WITHOUT_SPEED and context.ports and "speed" not in context.ports:
+            raise MessageError(
+                f"method {settings.method} needs the input speed, which is not wired; "
+                f"without a radar there are {', '.join(WITHOUT_SPEED)}"
+            )
         self._settings, self._rig = settings, context.rig
         self._method = settings.method
         self._gate = GlitchGate(settings.glitches)

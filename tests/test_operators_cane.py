@@ -14,7 +14,7 @@ from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, RadarFrame, 
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.runtime import Context, Operator, Refused
 from caneflow.simulation.scenario import Walk, simulate_walk, walk_settings
-from operators.fusion import Fusion, FusionSettings
+from operators.fusion import Fusion, FusionSettings, Method
 from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings
 
 
@@ -283,3 +283,22 @@ def test_a_wild_reading_of_the_imu_does_not_reach_the_ground_speed(wild: dict[st
     forward = [a.velocity[0] - b.velocity[0] for a, b in zip(found, speeds(), strict=True) if a.velocity and b.velocity]
     assert max(map(abs, off)) < 0.05
     assert max(map(abs, forward)) < 0.05
+
+
+def test_what_needs_no_speed_runs_where_none_is_wired_and_the_rest_says_so() -> None:
+    """Step and heading uses the speed not at all: the same poses with it and without."""
+    rig = read_rig({"boresight": [0, 1, 0], "pivot": [0, -0.3, 0], "step_length": 0.42})
+    alone = replace(context(rig), ports={"imu": Imu})
+    both = replace(context(rig), ports={"imu": Imu, "speed": GroundSpeed})
+    readings = [message for port, message in samples() if port == "imu"]
+    without: tuple[Method, ...] = ("shs", "naive_ins")
+    needing: tuple[Method, ...] = ("luenberger", "luenberger_fixed", "kalman", "best")
+    for method in without:
+        settings = FusionSettings(method=method)
+        one, other = Fusion(settings, alone), Fusion(settings, both)
+        assert [list(one.handle("imu", each)) for each in readings] == [
+            list(other.handle("imu", each)) for each in readings
+        ]
+    for method in needing:
+        with pytest.raises(MessageError, match=f"method {method} needs the input speed, which is not wired"):
+            Fusion(FusionSettings(method=method), alone)

@@ -11,7 +11,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.wording import did_you_mean, listed
 
 USUAL = Path("dataflow.yaml")  # the flow of the folder that a command is given in
-BEFORE = ("cane", "room")  # of those that fit a recording equally well
+BEFORE = ("cane", "room", "imu")  # of those that fit a recording equally well
 
 
 def shipped() -> dict[str, Path]:
