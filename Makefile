@@ -1,5 +1,5 @@
 # One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make docs`, `make soak`, `make bench`,
-# `make mcu-test`, `make clean`.
+# `make real`, `make mcu-test`, `make clean`.
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
@@ -9,7 +9,7 @@ REPEATS ?= 3
 # Flows are started by the hundred: each process would compile every module anew where this is set.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test lint docs soak bench mcu-test clean
+.PHONY: run test lint docs soak bench real mcu-test clean
 
 # The environment is made once, and again when the project's needs change.
 $(BIN)/.installed: pyproject.toml
@@ -62,6 +62,10 @@ bench: $(BIN)/.installed $(WALK)
 	$(BIN)/python -m benchmarks.scaling --repeats $(REPEATS) --write docs/performance_scaling.md --overwrite
 	$(BIN)/python -m benchmarks.pipeline $(WALK) --repeats $(REPEATS) --write docs/performance_pipeline.md --overwrite
 	$(BIN)/python -m benchmarks.peers --repeats $(REPEATS) --write docs/performance_peers.md --overwrite  # last: fails when slower
+
+# What is in ../shared/data through the product, and with REAL=FOLDER the files of a folder of yours: docs/results_real.md.
+real: $(BIN)/.installed
+	$(BIN)/python -m benchmarks.real $(if $(REAL),--mine $(REAL)) --write docs/results_real.md --overwrite
 
 clean:
 	rm -rf $(VENV) build
