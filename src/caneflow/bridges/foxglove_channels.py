@@ -58,7 +58,9 @@ class FoxgloveChannels:
         """Make the channels of a stream, so that clients see them before its first sample."""
         name = f"{node}/{port}"
         if name not in self._streams:
-            self._streams[name] = self._outputs(node, port, kind) if kind is not None else []
+            if kind is None:
+                return []
+            self._streams[name] = self._outputs(node, port, kind)
         return self._streams[name]
 
     def is_heard(self, node: str, port: str, kind: type[Sample] | None) -> bool:
@@ -73,6 +75,17 @@ class FoxgloveChannels:
                 channel.log(data, log_time=sample.stamp)
                 topics.append(topic)
         return topics
+
+    def take_unknown(self, node: str, port: str, schema: str, payload: bytes) -> None:
+        """Log a sample of a message whose class is not known here: the fields that its bytes hold, as JSON."""
+        name = f"{node}/{port}"
+        if name not in self._streams:
+            kind = sdk().Schema(name=schema or "unknown", encoding="jsonschema", data=b'{"type": "object"}')
+            channel = sdk().Channel(f"/{name}", message_encoding="json", schema=kind, context=self._context)
+            self._streams[name] = [Output(f"/{name}", channel, json_of)]
+        for _, channel, encode in self._streams[name]:
+            if channel.has_sinks() and (data := encode(payload)) is not None:
+                channel.log(data, log_time=json.loads(data).get("stamp"))
 
     def tell_rig(self, stamp: int) -> None:
         """Log what is bolted on (/tf_static), at `stamp` (ns)."""
@@ -156,6 +169,16 @@ def numbers_of(message: Sample) -> dict[str, Any]:
         for name, value in values.items()
         if not (value is None or isinstance(value, np.ndarray) or (isinstance(value, float) and math.isinf(value)))
     }
+
+
+def json_of(payload: bytes) -> bytes | None:
+    """The plain fields of a msgpack map as JSON; None: it is no map."""
+    try:
+        fields = msgspec.msgpack.decode(payload)
+        plain = {name: value for name, value in fields.items() if not isinstance(value, msgspec.msgpack.Ext | bytes)}
+        return msgspec.json.encode(plain)
+    except (msgspec.MsgspecError, AttributeError, ValueError, TypeError):
+        return None
 
 
 def _odometry(pose: Pose, world: str) -> bytes:

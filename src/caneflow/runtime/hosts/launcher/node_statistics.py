@@ -176,6 +176,7 @@ class NodeStatistics:
             connect=node.plan.links.connect,
             held=counted.now.held if counted else 0,
             let_go=counted.now.let_go if counted else 0,
+            settings=node.plan.settings,
         )
 
     def _heard_of(
