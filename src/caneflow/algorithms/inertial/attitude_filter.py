@@ -1,20 +1,22 @@
 """Attitude from gyro, accelerometer and magnetometer, each used for what it alone knows.
 
-The gyro, less its bias, turns an attitude from sample to sample: exact, and it drifts. In the world so found the
+The gyro, less its bias, turns an attitude from sample to sample: exact, and it drifts. A reading counts for the
+interval before it: a gyro averages over at least that, or its readings would alias. In the world so found the
 motion's own acceleration averages out over a few seconds, since nobody speeds up for ever, and what is left of the
 specific force is gravity: it is low-passed *there*, not in the turning body, and the attitude is turned by just so
 much that it points up. Yaw is corrected by the magnetometer alone, and only as far as the field looks undisturbed;
 inclination never is. What has to be corrected again and again is the gyro's bias.
 
-The idea of low-passing in an almost inertial frame is VQF's: D. Laidig, T. Seel, "VQF: Highly accurate IMU
-orientation estimation with bias estimation and magnetic disturbance rejection", Information Fusion 91, 2023. The
-filters here are others: two first-order low passes (so that any interval will do), a scalar Kalman filter for yaw.
+Low-passing in an almost inertial frame, by a Butterworth filter of order 2, is VQF's: D. Laidig, T. Seel, "VQF: Highly
+accurate IMU orientation estimation with bias estimation and magnetic disturbance rejection", Information Fusion 91,
+2023. Here its steps may differ in length, and a scalar Kalman filter follows yaw.
 
 World: x east, y magnetic north, z up.
 """
 
 import math
 from dataclasses import dataclass, field
+from typing import TypeVar, cast
 
 from caneflow.algorithms.inertial.attitude_recovery import FIELD_ERROR, SMALLEST, Holes, Recovery
 from caneflow.algorithms.inertial.gyro_bias import (
@@ -41,7 +43,7 @@ from caneflow.algorithms.rotations import (
     rotate,
 )
 
-SETTLING = 6.0  # time constants of a low pass after which its corrections tell of the gyro's bias
+SETTLING = 3.0  # delays of the low pass after which its corrections tell of the gyro's bias
 LEAST_FORCE = 1.0  # m/s^2; a mean specific force below is free fall, or no accelerometer
 
 
@@ -61,7 +63,7 @@ class AttitudeFilter:
         self._clock = SampleClock()
         self._attitude: Quaternion | None = None  # body to world but for yaw, which the gyro integrates
         self._gyro: Vector = (0.0, 0.0, 0.0)  # of the sample before
-        self._gravity = _Gravity(0.5 * settings.inclination_time)
+        self._gravity = _Gravity(settings.inclination_time)
         self._heading = MagneticHeading(settings.heading)
         self._since_accel = self._since_field = 0.0  # s since the last reading of each
         self._rest = RestDetector(settings.bias)
@@ -115,22 +117,21 @@ class AttitudeFilter:
         if interval > LONGEST_INTERVAL:
             self._begin_recovery(spread or math.inf)
             return self._attitude, 0.0
-        if spread > SMALLEST or (spread > 0.0 and self._recovery is not None):
+        if spread == 0.0:
+            return self._turned(self._attitude, gyro, interval), interval
+        (ax, ay, az), (bx, by, bz) = self._gyro, gyro
+        attitude = self._turned(self._attitude, (0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz)), interval)
+        if spread > SMALLEST or self._recovery is not None:
             self._begin_recovery(spread)
-            return self._turned(self._attitude, gyro, interval), 0.0
-        return self._turned(self._attitude, gyro, interval), interval
+            interval = 0.0
+        return attitude, interval
 
-    def _turned(self, attitude: Quaternion, gyro: Vector, interval: float) -> Quaternion:
-        """By the mean of this reading and the one before, less the bias."""
+    def _turned(self, attitude: Quaternion, rate: Vector, interval: float) -> Quaternion:
+        """At a turn rate (rad/s), less the bias."""
+        x, y, z = rate
         bx, by, bz = self._bias.bias
-        ax, ay, az = self._gyro
-        half = 0.5 * interval
-        turn = (
-            half * (ax + gyro[0]) - interval * bx,
-            half * (ay + gyro[1]) - interval * by,
-            half * (az + gyro[2]) - interval * bz,
-        )
-        return normalized(multiply(attitude, from_rotation_vector(turn)))
+        turn = from_rotation_vector((interval * (x - bx), interval * (y - by), interval * (z - bz)))
+        return normalized(multiply(attitude, turn))
 
     def _begin_recovery(self, spread: float) -> None:
         """What the turn rate may have done in a hole; what was not yet found of the one before adds to it."""
@@ -216,28 +217,34 @@ class AttitudeFilter:
 
 
 class _Gravity:
-    """The specific force behind two first-order low passes, in a world that is turned until it points up."""
+    """The specific force behind a Butterworth low pass of order 2, in a world that is turned until it points up.
 
-    def __init__(self, time_constant: float) -> None:
-        self._time_constant = time_constant  # s, of each
+    Its delay is `delay`, as that of two first-order low passes of half of it each, but a motion's acceleration, above
+    the corner of sqrt(2) / delay, gets through half as much.
+    """
+
+    def __init__(self, delay: float) -> None:
+        self._delay = delay  # s
+        self._step = _LowPassStep(0.0, delay)
         self.restart()
 
     def restart(self, force: Vector | None = None, elapsed: float = 0.0) -> None:
         """Take `force`, a mean over `elapsed` s, or the next as it is; from there the mean, while that is younger."""
-        self._once: Vector | None = force
-        self._twice: Vector = force or (0.0, 0.0, 0.0)
-        self._rows_once = self.rows = (NOTHING_SEEN, NOTHING_SEEN)
+        self._mean: Vector | None = force
+        self._rise: Vector = (0.0, 0.0, 0.0)  # what it changes by, in units of the corner frequency
+        self.rows = (NOTHING_SEEN, NOTHING_SEEN)
+        self._row_rises = (NOTHING_SEEN, NOTHING_SEEN)
         self._elapsed = elapsed  # s
 
     @property
     def levelled(self) -> bool:
         """Whether most of an error of the start is gone."""
-        return self._elapsed > 2.0 * self._time_constant
+        return self._elapsed > self._delay
 
     @property
     def settled(self) -> bool:
         """Whether what is corrected is no longer an error of the start."""
-        return self._elapsed > SETTLING * self._time_constant
+        return self._elapsed > SETTLING * self._delay
 
     @staticmethod
     def usable(force: Vector) -> bool:
@@ -246,23 +253,55 @@ class _Gravity:
 
     def update(self, force: Vector, rows: tuple[Row, Row], interval: float) -> Quaternion | None:
         """The turn that keeps gravity up; None for the first force, and where nothing tells what is up."""
-        if self._once is None:
-            self._once = self._twice = force
+        if self._mean is None:
+            self._mean = force
             return None
         self._elapsed += interval
-        share = interval / (min(self._time_constant, self._elapsed) + interval)
-        once = _followed(self._once, force, share)
-        twice = _followed(self._twice, once, share)
-        (x_row, y_row), (x_once, y_once) = self.rows, self._rows_once
-        x_once, y_once = followed_row(x_once, rows[0], share), followed_row(y_once, rows[1], share)
-        self._rows_once = x_once, y_once
-        self.rows = followed_row(x_row, x_once, share), followed_row(y_row, y_once, share)
-        if not self.usable(twice):
-            self._once, self._twice = once, twice
+        if self._elapsed < self._delay:
+            share = interval / self._elapsed if self._elapsed > 0.0 else 1.0
+            self._mean = _followed(self._mean, force, share)
+            self.rows = followed_row(self.rows[0], rows[0], share), followed_row(self.rows[1], rows[1], share)
+        else:
+            self._follow(force, rows, interval)
+        if not self.usable(self._mean):
             return None
-        correction = level(twice)
-        self._once, self._twice = rotate(correction, once), rotate(correction, twice)
+        correction = level(self._mean)
+        self._mean, self._rise = rotate(correction, self._mean), rotate(correction, self._rise)
         return correction
+
+    def _follow(self, force: Vector, rows: tuple[Row, Row], interval: float) -> None:
+        if interval != self._step.interval:
+            self._step = _LowPassStep(interval, self._delay)
+        assert self._mean is not None
+        (x_row, y_row), (x_rise, y_rise) = self.rows, self._row_rises
+        self._mean, self._rise = self._step.of(self._mean, self._rise, force)
+        x_row, x_rise = self._step.of(x_row, x_rise, rows[0])
+        y_row, y_rise = self._step.of(y_row, y_rise, rows[1])
+        self.rows, self._row_rises = (x_row, y_row), (x_rise, y_rise)
+
+
+V = TypeVar("V", Vector, Row)
+
+
+class _LowPassStep:
+    """One step of a second-order Butterworth low pass, exact for an input that holds over it."""
+
+    def __init__(self, interval: float, delay: float) -> None:
+        """Both in s; the corner is at sqrt(2) / delay, rad/s."""
+        self.interval = interval
+        angle = interval / delay
+        fallen = math.exp(-angle)
+        cosine, sine = fallen * math.cos(angle), fallen * math.sin(angle)
+        self._off_off, self._off_rise = cosine + sine, math.sqrt(2.0) * sine
+        self._rise_off, self._rise_rise = -math.sqrt(2.0) * sine, cosine - sine
+
+    def of(self, mean: V, rise: V, target: V) -> tuple[V, V]:
+        """The output and what it changes by, after a step with the input `target`."""
+        a, b, c, d = self._off_off, self._off_rise, self._rise_off, self._rise_rise
+        off = [m - t for m, t in zip(mean, target, strict=True)]
+        moved = tuple([t + a * o + b * r for t, o, r in zip(target, off, rise, strict=True)])
+        risen = tuple([c * o + d * r for o, r in zip(off, rise, strict=True)])
+        return cast(V, moved), cast(V, risen)
 
 
 def _followed(value: Vector, target: Vector, share: float) -> Vector:
