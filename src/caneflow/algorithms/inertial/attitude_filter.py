@@ -32,6 +32,7 @@ from caneflow.algorithms.inertial.gyro_bias import (
 from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleClock
 from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, level, required_start
 from caneflow.algorithms.inertial.magnetic_heading import MagneticHeading, MagneticHeadingSettings
+from caneflow.algorithms.inertial.magnetometer_lag import MagnetometerLag
 from caneflow.algorithms.quantities import Time
 from caneflow.algorithms.rotations import (
     Quaternion,
@@ -65,6 +66,7 @@ class AttitudeFilter:
         self._gyro: Vector = (0.0, 0.0, 0.0)  # of the sample before
         self._gravity = _Gravity(settings.inclination_time)
         self._heading = MagneticHeading(settings.heading)
+        self._lag = MagnetometerLag()
         self._since_accel = self._since_field = 0.0  # s since the last reading of each
         self._rest = RestDetector(settings.bias)
         self._bias = GyroBias(settings.bias)
@@ -98,12 +100,22 @@ class AttitudeFilter:
         """
         attitude, interval = self._predicted(stamp_ns, gyro, accel)
         self._gyro = gyro
+        if mag is not None:
+            mag = self._less_lag(attitude, gyro, mag, interval)
         if self._recovery is None:
             self._attitude = self._corrected(attitude, gyro, accel, mag, interval)
             return AttitudeEstimate(self._with_yaw(self._attitude), self._bias.bias)
         self._attitude = attitude
         found = self._found(self._recovery, attitude, gyro, accel, mag, interval)
         return AttitudeEstimate(self._with_yaw(found), self._bias.bias)
+
+    def _less_lag(self, attitude: Quaternion, gyro: Vector, mag: Vector, interval: float) -> Vector:
+        """The magnetometer's reading, without what it lags behind the gyro."""
+        if self._recovery is not None:
+            self._lag.restart()
+        else:
+            self._lag.learn(rotate(attitude, mag), rotate(attitude, gyro), self._since_field + interval)
+        return self._lag.taken_off(mag, gyro)
 
     def _predicted(self, stamp_ns: int, gyro: Vector, accel: Vector | None) -> tuple[Quaternion, float]:
         """The attitude by the gyro alone, and the s over which it was integrated."""

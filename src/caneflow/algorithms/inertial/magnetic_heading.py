@@ -19,6 +19,8 @@ TURNING = math.radians(20.0)  # rad/s; a field that is steady while the body tur
 LARGEST_DISTRUST = 1000.0
 FAR = 10.0  # deviations; one that is further is distrusted no more, and its fourth power may be no number
 SETTLED = 1.5  # times the steady variance, below which corrections are of now, not of what was
+# rad/s; a gyro's scale errors make the offset wander, and at this turn rate as fast as everything else does
+WANDERING = math.radians(100.0)
 LEVELLING_MEMORY = 1.0  # s of readings that count before the attitude is level
 
 
@@ -167,7 +169,7 @@ class MagneticHeading:
         self._deviation = self._reference.deviation(strength, math.atan2(-up, level), turn_rate, interval)
         distrust = min(1.0 + 10.0 * min(self._deviation, FAR) ** 4, LARGEST_DISTRUST)
         noise = distrust * self._settings.time_constant**2
-        gain = self._gain(noise, interval)
+        gain = self._gain(noise, interval, 1.0 + (turn_rate / WANDERING) ** 2)
         if not levelled:
             self._variance = max(self._variance, noise / LEVELLING_MEMORY)
         turn = gain * wrapped(NORTH_YAW - math.atan2(north, east) - self.offset)
@@ -176,13 +178,13 @@ class MagneticHeading:
         settled = self._variance < SETTLED * self._settings.time_constant and not self.disturbed
         return turn if settled else None
 
-    def _gain(self, noise: float, interval: float) -> float:
-        """The Kalman gain; `noise` in s^2, the variance of a reading that stands for 1 s."""
+    def _gain(self, noise: float, interval: float, wander: float) -> float:
+        """The Kalman gain; `noise` in s^2, the variance of a reading that stands for 1 s; `wander` times the usual."""
         if math.isinf(self._variance):
             if interval > 0.0:
                 self._variance = noise / interval
             return 1.0
-        self._variance += interval
+        self._variance += wander * interval
         gain = self._variance * interval / (self._variance * interval + noise)
         self._variance *= 1.0 - gain
         return gain
