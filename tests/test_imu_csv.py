@@ -306,7 +306,8 @@ def test_the_encoding_is_found(encoding: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "unit"), [("0.01", "s"), ("10", "ms"), ("0.5", "ms"), ("10000", "us"), ("2500000", "ns"), ("1.16e-7", "d")]
+    ("step", "unit"),
+    [("0.01", "s"), ("10", "ms"), ("0.8", "ms"), ("0.2", "s"), ("10000", "us"), ("2500000", "ns"), ("1.16e-7", "d")],
 )
 def test_the_unit_of_time_is_that_in_which_the_step_is_an_imus(step: str, unit: str) -> None:
     rows = table(*rest([float(step) * k for k in range(300)]), units={})
@@ -320,6 +321,8 @@ def test_what_is_told_of_time_holds_and_the_doubt_is_named() -> None:
     assert stamps_ms(rows)[1] == 10_000
     (doubt,) = (line for line in rows.doubts() if line.startswith("time"))
     assert "by their size the numbers are ms" in doubt
+    slow = table(*rest([0.2 * k for k in range(50)]), units={})
+    assert any("5 Hz is slow, 5e+03 Hz possible too; --units time=UNIT settles it" in line for line in slow.doubts())
     counting = table(*rest(range(100)), units={})
     assert any("sample numbers? --rate HZ" in line for line in counting.doubts())
 
@@ -462,6 +465,14 @@ def test_a_clock_that_begins_again_goes_on_one_step_later_as_often_as_it_does() 
     found, repairs = clock([STEP * (k % 70) for k in range(210)])
     assert found == [STEP * k for k in range(210)]
     assert list(repairs.counts.values()) == [2]
+
+
+@pytest.mark.parametrize("place", range(2, 15))
+def test_a_clock_that_begins_again_soon_does_so_too(place: int) -> None:
+    times = [STEP * (k if k < place else k - place) for k in range(100)]
+    found, repairs = clock(times)
+    assert found == [STEP * k for k in range(100)]
+    assert list(repairs.counts.values()) == [1]
 
 
 @pytest.mark.parametrize("place", [0, 1, 2, 57, 198, 199])

@@ -73,6 +73,8 @@ class Joined:
         if not apart.any():
             return found
         missing = ~np.isfinite(found[:, 0])
+        if not missing.any():
+            return found
         between = interpolated(table.stamps[apart], vectors[apart], self.stamps[missing])
         if name == "orientation":
             between /= np.linalg.norm(between, axis=1)[:, None]

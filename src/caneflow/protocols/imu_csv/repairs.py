@@ -68,7 +68,7 @@ class _Clock:
         self._step, self._near = _usual_steps(times)
         self._offset = 0  # what has been lost by wraps and resets so far
         self._skip_to = 0  # rows before this one are known to lie off
-        self._recent: deque[int] = deque(maxlen=BURST + 1)  # rows on the clock, newest last
+        self._recent: deque[int] = deque(maxlen=BURST + 2)  # rows on the clock, newest last
 
     def take(self, row: int) -> None:
         """Put a row on the clock, or leave it, or rows before it, out."""
@@ -131,16 +131,23 @@ class _Clock:
                 fell = last - self._at(row) > self._near
                 alone = count == 1 and fell and not self._period(row) and not self._newest_rows_off(row)
                 return 1 if alone else 0
-            if last <= self._at(row + count) <= last + (count + 1) * self._near:
-                return count
+            following = self._at(row + count)
+            if last <= following <= last + (count + 1) * self._near:
+                at_once = count == 1 and following > last + self._step // 2
+                return count if at_once or not self._begins_anew(row) else 0
         return 0
+
+    def _begins_anew(self, row: int) -> bool:
+        """Whether a clock that has only begun falls to its very beginning, or before: no row comes that late."""
+        here = self._at(row)
+        return self._recent[0] == 0 and here <= self._stamp(0) and self._stamp(-1) - here <= self._near
 
     def _newest_rows_off(self, row: int) -> int:
         """How many rows before this one lie off, because it goes on from the row before those; 0: none do."""
         here = self._at(row)
         for count in range(1, len(self._recent)):
             before = self._stamp(-count - 1)
-            if before <= here <= before + (count + 1) * self._near:
+            if before <= here <= before + (count + 1) * self._near and not self._begins_anew(row):
                 return count
         fell = self._stamp(-1) - here
         return 1 if self._is_at_start() and fell > max(FAR, self._near) and not self._period(row) else 0

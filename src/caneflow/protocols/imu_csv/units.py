@@ -23,7 +23,8 @@ UNITS: dict[str, dict[str, float]] = {
 UNITS["linear_accel"] = UNITS["accel"]
 DEFAULT_UNITS = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
 
-STEPS = (2e-4, 0.1)  # s between readings: an IMU is read 10 to 5000 times a second
+STEPS = (6e-4, 0.59)  # s between readings, 1.7 to 1700 Hz: of units a thousand apart at most one fits
+SLOW = 0.1  # s: a thousandth of a longer step is one of a fast IMU
 GYRO_FULL_SCALE = math.radians(2000.0)  # rad/s, of nearly every gyro that people carry
 GYRO_FULL_SCALE_DEGREES = 4000.0  # deg/s; more is mdeg/s
 REST = (0.7, 1.4)  # median of an accelerometer's magnitude over gravity, at rest or walking
@@ -103,7 +104,11 @@ def judged_time(step: float, *, told: str | None, stated: str | None, counts: bo
         return Judged(unit, why, f"it counts by 1: sample numbers? --rate HZ, or --units time={unit}, settles it")
     if size is None:
         rate = 1e9 / (step * UNITS["time"][unit])
-        return Judged(unit, why, f"{rate:.3g} Hz is unlikely; --units time=UNIT settles it")
+        return Judged(unit, why, f"{rate:.3g} Hz is unusual; --units time=UNIT settles it")
+    if stated is None and step * UNITS["time"][unit] * 1e-9 > SLOW:
+        rate = 1e9 / (step * UNITS["time"][unit])
+        doubt = f"{rate:.3g} Hz is slow, {1000 * rate:.3g} Hz possible too; --units time=UNIT settles it"
+        return Judged(unit, why, doubt)
     return Judged(unit, why, _contradiction("time", unit, size))
 
 
