@@ -229,7 +229,8 @@ def test_a_recording_with_nothing_to_draw_says_so(caneflow: Callable[..., Run], 
     status, _, err = caneflow("plot", path, "-o", tmp_path / "walk.png")
     assert status == 2
     assert err == (
-        f"caneflow plot: {path}: nothing to draw: no poses, speeds, radar frames, Doppler blocks or IMU samples\n"
+        f"caneflow plot: {path}: nothing to draw; expected 2 poses or IMU samples, 8 radar scans, "
+        "or 0.3 s of a Doppler module\n"
     )
 
 

@@ -193,7 +193,9 @@ def read_picture(path: Path) -> Picture:
         if not (poses or truth):
             _add_single_sensors(picture, recording)
     if not (poses or truth or picture.radar or picture.modules or picture.imu or picture.speeds):
-        raise RecordingError(f"{path}: nothing to draw: no poses, speeds, radar frames, Doppler blocks or IMU samples")
+        raise RecordingError(
+            f"{path}: nothing to draw; expected 2 poses or IMU samples, 8 radar scans, or 0.3 s of a Doppler module"
+        )
     return picture
 
 
