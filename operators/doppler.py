@@ -7,7 +7,7 @@ out  target : DopplerTarget   one per hop of 50 ms (a longer block gives one), o
 from dataclasses import dataclass, field
 
 from caneflow.algorithms.quantities import RangeCalibration
-from caneflow.algorithms.radar.doppler_line import DopplerLineSettings, predominant_line, range_from_strength
+from caneflow.algorithms.radar.doppler_line import DopplerLineSettings, LineFollower, range_from_strength
 from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrumSettings, SlidingSpectrum
 from caneflow.messages import DopplerBlock, DopplerTarget, MessageError, Sample
 from caneflow.messages.rig import Rig
@@ -36,7 +36,7 @@ class Doppler(Operator):
 
     def __init__(self, settings: DopplerSettings, context: Context) -> None:
         self._spectrum = SlidingSpectrum(settings.spectrum)
-        self._line = settings.line
+        self._line = LineFollower(settings.line)
         self._k = settings.k or range_calibration(settings.sensor, context.rig)
 
     def handle(self, port: str, message: Sample) -> Emitted:
@@ -48,7 +48,7 @@ class Doppler(Operator):
             raise Refused(str(error)) from error
         if spectrum is None:
             return
-        line = predominant_line(spectrum, self._line)
+        line = self._line.update(spectrum)
         with_range = self._k is not None and line.valid
         yield (
             "target",

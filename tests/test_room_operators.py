@@ -109,16 +109,18 @@ def told(operator: RoomTrackerOperator, *samples: tuple[str, Sample]) -> list[Po
 
 
 def test_a_block_becomes_a_target_with_its_range() -> None:
+    """After two seconds of an empty room."""
     operator = front_end(sensor="south")
-    out = [sample for index in range(20) for _, sample in operator.handle("block", block(index))]
+    blocks = [block(index, -155.0, 0.1 if index >= 40 else 0.0) for index in range(60)]
+    out = [sample for each in blocks for _, sample in operator.handle("block", each)]
     last = out[-1]
     assert isinstance(last, DopplerTarget)
-    assert len(out) == 20 - 5  # 256 ms take six blocks
-    assert last.stamp == block(19).stamp
+    assert len(out) == 60 - 5  # 256 ms take six blocks
+    assert last.stamp == blocks[-1].stamp
     assert last.signed
     assert last.valid
     assert last.delay == pytest.approx(0.128)
-    assert last.range_rate == pytest.approx(150.0 / 160.93, abs=0.01)
+    assert last.range_rate == pytest.approx(155.0 / 160.93, abs=0.01)
     assert last.range == pytest.approx((0.8 / 0.1**2) ** 0.25, rel=0.01)
 
 

@@ -18,7 +18,7 @@ from rich.progress import track
 from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
 from caneflow.algorithms.inertial.imu_sample import heading_of
 from caneflow.algorithms.inertial.standing import StandingDetector, StandingSettings
-from caneflow.algorithms.radar.doppler_line import DopplerLineSettings, predominant_line
+from caneflow.algorithms.radar.doppler_line import DopplerLineSettings, LineFollower
 from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
 from caneflow.algorithms.room.room_calibration import CalibrationSettings, counting, hops_over, range_calibration, sight
 from caneflow.algorithms.room.room_ekf import RoomEkf, RoomEkfSettings
@@ -227,10 +227,10 @@ def headings_of(recording: RoomRecording) -> list[tuple[int, float, bool]]:
 
 def echoes_of(recording: RoomRecording, sensor: str) -> list[Echo]:
     """What one module sees of the person, with the noise floor that the front end learns by itself."""
-    settings = DopplerLineSettings()
+    follower = LineFollower(DopplerLineSettings())
     found = []
     for stamp, spectrum in spectra_of(recording, sensor):
-        line = predominant_line(spectrum, settings)
+        line = follower.update(spectrum)
         strength = 20.0 * math.log10(line.amplitude) if line.amplitude > 0.0 else None
         found.append(
             Echo(

@@ -1,42 +1,39 @@
 """The short-time power spectrum of a continuous-wave Doppler module's output, and the noise under it.
 
 A line of amplitude A (full scale = 1) has the power A^2 in its bin, whatever the window, so spectra of different
-windows and of real and complex modules compare. The noise floor is learnt per bin, so that lamp hum and 1/f noise
-are part of it: the smallest value that the smoothed spectrum has had for a while, as a person who walks does not
-stay on one frequency (minimum statistics: R. Martin, IEEE Trans. Speech and Audio Processing 9(5), 2001).
+windows and of real and complex modules compare. The noise floor is learnt per bin (`noise_floor`), so that mains hum
+and the amplifier's 1/f noise are part of it. A spectrum reaches beyond the band, so that a target that is too fast
+for it is seen to be there, and no part of it in the band is taken for the whole.
 
 A window in which the channel, or one of I and Q, stands still for a whole period of the lowest frequency is silent:
 it has no spectrum, and the floor learns nothing from it. Single impulses and steps are taken out before the transform.
 """
 
-from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
 import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
 from caneflow.algorithms.glitches import JumpGate
 from caneflow.algorithms.quantities import Frequency, Time, Zero
+from caneflow.algorithms.radar.noise_floor import LEAST_POWER, NoiseFloor
 from caneflow.algorithms.radar.waveform_faults import mended
 
 INT16_FULL_SCALE = 32768.0
-SMOOTHING = 0.95  # per hop, of the spectrum whose minimum is taken: 1 s at the hop of 50 ms
-FLOOR_BIAS = 0.565  # that minimum over 20 s of white noise, relative to its mean; a test simulates it
-QUARTILE = 0.288  # lower quartile of one spectrum of white noise, relative to its mean: ln(4/3)
-SETTLING = 20  # spectra before the first minimum is taken
-REFRESH = 4  # spectra between two looks at the minima
-PARTS = 8  # of the memory; the oldest is forgotten as a whole
-BROAD = 21  # bins, 40 Hz; a line fills 4
-SMEAR = 30.0  # over the lower quartile of the floor, 15 dB: as much as 1/f noise may rise at the low end
-LEAST_POWER = 1e-16  # of full scale: far below the last bit of any converter
+# int16 without noise is a staircase, whose lines are no target's: ten times the power that rounding has as white noise
+# in a window of 1024 samples, half a bit's
+STAIRCASE = 5e-12
+BEYOND = 2.0  # times the highest frequency of the band: what is stronger there is looked for, too
+HIGHEST_BEYOND = 0.9  # of the Nyquist frequency, where filters against aliasing end
 # What drifts or settles slowly has most of its power below the band. Of an exponential, and of a straight line, a Hann
 # window lets at most -19 dB of it through beyond 2.4 cells, and 18 dB an octave less farther off (worked out for time
 # constants above 0.1 s; the window's own side lobes: F. Harris, Proc. IEEE 66(1), 1978).
 LEAK = 10.0**-1.8
 LEAK_FROM = 2.4  # cells, 1 / window
+MOST_ROWS = 1000  # of the floor's memory
 LARGEST_WINDOW = 1 << 20  # samples: 5 s of a sound card's 192 kHz
 FORGOTTEN = 1.0  # s without a block, after which one of another make is believed at once
 
@@ -45,7 +42,7 @@ Make: TypeAlias = tuple[float, float, bool]  # sample rate and carrier (Hz), I a
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerSpectrumSettings:
-    """Window, hop, band (room.md row 8), and how long the floor's minimum looks back."""
+    """Window, hop, band (room.md row 8), and how long the floor remembers."""
 
     window: Annotated[float, Ge(1e-3), Le(60)] = 0.256  # s, Hann
     hop: Annotated[float, Ge(1e-3), Le(60)] = 0.05  # s between spectra; a block that is longer gives one all the same
@@ -57,7 +54,7 @@ class DopplerSpectrumSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DopplerSpectrum:
-    """Power of one window in the band."""
+    """Power of one window in the band, and beyond its upper end."""
 
     frequencies: NDArray[np.float64]  # shape (B,), Hz, increasing; positive is approaching, negative only if signed
     power: NDArray[np.float64]  # shape (B,), squared amplitude of a line on that frequency, full scale = 1
@@ -67,6 +64,11 @@ class DopplerSpectrum:
     noise_bandwidth: float  # bins that one line's power is spread over: sum of `power` / noise_bandwidth = energy
     leak: NDArray[np.float64]  # shape (B,), the most power that what lies below the band may show there
     silent: bool  # the channel carried nothing; `power` is 0
+    lowest: float  # Hz, where the band begins
+    highest: float  # Hz, where it ends
+    cell: float  # Hz, 1 / window: how far apart two lines have to be
+    floor_slack: float  # dB by which the floor may be too low in some bin; infinite while it is not known
+    elapsed: float  # s since the spectrum before
 
 
 class SlidingSpectrum:
@@ -126,7 +128,7 @@ class SlidingSpectrum:
         self._take(samples)
         due = self._since_hop >= self._hop
         self._since_hop %= self._hop
-        return self._spectrum() if due and self._filled == len(self._kept) else None
+        return self._spectrum(stamp_ns) if due and self._filled == len(self._kept) else None
 
     def _impossible(self, sample_rate: float) -> str:
         """What is wrong with a rate; empty when nothing is."""
@@ -148,13 +150,15 @@ class SlidingSpectrum:
         self._longest_still = round(min(sample_rate / max(settings.lowest, 1e-9), 0.5 * count))
         self._hop = max(round(settings.hop * sample_rate), 1)
         self._since_hop = 0
+        self._given_ns: int | None = None  # stamp of the last spectrum
         self._hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(count) / count)
         self._length = fft.next_fast_len(round(settings.padding * count), real=not signed)
         frequencies = fft.fftfreq(self._length, 1.0 / sample_rate)
         if not signed:
             frequencies = np.abs(frequencies[: self._length // 2 + 1])
         order = np.argsort(frequencies, kind="stable")
-        in_band = (np.abs(frequencies) >= settings.lowest) & (np.abs(frequencies) <= settings.highest)
+        beyond = max(settings.highest, min(BEYOND * settings.highest, 0.5 * HIGHEST_BEYOND * sample_rate))
+        in_band = (np.abs(frequencies) >= settings.lowest) & (np.abs(frequencies) <= beyond)
         self._bins = order[in_band[order]]
         self._frequencies = frequencies[self._bins]
         self._below = np.flatnonzero((np.abs(frequencies) > 0.0) & (np.abs(frequencies) < settings.lowest))
@@ -164,7 +168,9 @@ class SlidingSpectrum:
         self._scale = ((1.0 if signed else 2.0) / self._hann.sum()) ** 2
         # Parseval: a line of power 1 gives this in sum over the bins of its lobe
         self._noise_bandwidth = self._length * float((self._hann**2).sum()) / float(self._hann.sum()) ** 2
-        self._floor = NoiseFloor(max(round(settings.floor_memory / settings.hop), 1))
+        spacing = max(round(0.5 * settings.window / settings.hop), 1)
+        rows = min(round(settings.floor_memory / (spacing * settings.hop)), MOST_ROWS)
+        self._floor = NoiseFloor(rows, spacing, self._length / count)
 
     def _forget_over_gap(self, stamp_ns: int, count: int) -> None:
         """Start the window anew where samples are missing; half a block of jitter is none."""
@@ -176,7 +182,9 @@ class SlidingSpectrum:
             self._filled = self._since_hop = 0
 
     def _take(self, samples: NDArray[np.number]) -> None:
-        scaled = samples / INT16_FULL_SCALE if samples.dtype.kind == "i" else samples
+        whole = samples.dtype.kind == "i"
+        scaled = samples / INT16_FULL_SCALE if whole else samples
+        self._least_floor = STAIRCASE if whole else LEAST_POWER
         size = len(self._kept)
         fresh = scaled[-size:]
         self._kept[: size - len(fresh)] = self._kept[len(fresh) :].copy()
@@ -184,7 +192,7 @@ class SlidingSpectrum:
         self._filled = min(self._filled + len(samples), size)
         self._since_hop += len(samples)
 
-    def _spectrum(self) -> DopplerSpectrum:
+    def _spectrum(self, stamp_ns: int) -> DopplerSpectrum:
         assert self._make is not None
         _, carrier, signed = self._make
         samples, still = self._mended(signed)
@@ -195,15 +203,25 @@ class SlidingSpectrum:
             transform = fft.fft(windowed, self._length) if signed else fft.rfft(windowed, self._length)
             power = self._power(transform[self._bins])
             below = float(self._power(transform[self._below]).max(initial=0.0))
+        elapsed = 0.0 if self._given_ns is None else 1e-9 * (stamp_ns - self._given_ns)
+        self._given_ns = stamp_ns
+        slack = self._floor.slack
         return DopplerSpectrum(
             frequencies=self._frequencies,
             power=power,
-            floor=np.full(len(power), LEAST_POWER) if silent else self._floor.update(power),
+            floor=np.full(len(power), LEAST_POWER)
+            if silent
+            else np.maximum(self._floor.update(power), self._least_floor),
             signed=signed,
             carrier=carrier,
             noise_bandwidth=self._noise_bandwidth,
             leak=below * self._leak,
             silent=silent,
+            lowest=self._settings.lowest,
+            highest=self._settings.highest,
+            cell=1.0 / self._settings.window,
+            floor_slack=slack,
+            elapsed=elapsed,
         )
 
     def _power(self, lines: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -216,62 +234,6 @@ class SlidingSpectrum:
             return mended(self._kept.real)
         in_phase, quadrature = mended(self._kept.real), mended(self._kept.imag)
         return in_phase.samples + 1j * quadrature.samples, max(in_phase.still, quadrature.still)
-
-
-class NoiseFloor:
-    """Per bin the minimum of the smoothed power over the last `memory` spectra.
-
-    Somebody who walks for long at one speed leaves a broad rise, which is taken off. Until there has been time for a
-    minimum, a line that stands would be taken for noise; so at first no floor is further above the quieter bins' than
-    1/f noise may be.
-    """
-
-    def __init__(self, memory: int) -> None:
-        self._part = max(memory // PARTS, SETTLING)  # spectra per part
-        self._minima: deque[NDArray[np.float64]] = deque(maxlen=PARTS)
-        self._smooth: NDArray[np.float64] | None = None
-        self._floor: NDArray[np.float64] | None = None
-        self._count = 0
-
-    def update(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The floor, shape (B,), after one more spectrum of shape (B,)."""
-        self._count += 1
-        if self._smooth is None:
-            self._smooth = power.copy()
-        else:  # at first the plain mean: a single spectrum has zeros
-            self._smooth += max(1.0 - SMOOTHING, 1.0 / self._count) * (power - self._smooth)
-        if self._count <= SETTLING:
-            highest = SMEAR * _lower_quartile(power) / QUARTILE
-            return self._raised(np.minimum(self._smooth, highest))
-        if (self._count - SETTLING - 1) % self._part == 0:
-            self._minima.append(self._smooth.copy())
-        else:
-            np.minimum(self._minima[-1], self._smooth, out=self._minima[-1])
-        if self._count % REFRESH == 0 or self._floor is None:
-            self._floor = self._found()
-        return self._floor
-
-    def _found(self) -> NDArray[np.float64]:
-        floor = np.asarray(np.min(self._minima, axis=0), dtype=np.float64) / FLOOR_BIAS
-        if self._count <= self._part:
-            np.minimum(floor, SMEAR * _lower_quartile(floor), out=floor)
-        return self._raised(self._without_smear(floor))
-
-    @staticmethod
-    def _without_smear(floor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is both broad and far above the quiet bins is a person who walked on and on; hum is narrow."""
-        broad = ndimage.median_filter(floor, size=BROAD, mode="nearest")
-        highest = SMEAR * _lower_quartile(floor)
-        return np.asarray(floor * np.minimum(1.0, highest / np.maximum(broad, LEAST_POWER)), dtype=np.float64)
-
-    @staticmethod
-    def _raised(floor: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.maximum(floor, LEAST_POWER)
-
-
-def _lower_quartile(values: NDArray[np.float64]) -> float:
-    at = len(values) // 4
-    return float(np.partition(values, at)[at])
 
 
 def apart(one: Make, other: Make) -> float:
