@@ -31,7 +31,8 @@ from caneflow.protocols.bno055_chip import Chip, Setup
 from caneflow.protocols.bno055_emulator import Bench, Emulator, Faults, Motion
 from caneflow.protocols.bno055_link import UartLink
 from caneflow.protocols.errors import ProtocolError
-from caneflow.protocols.mrm_scans import Scan, ScanAssembler, parse_log, split_scan
+from caneflow.protocols.mrm_logs import parse_log
+from caneflow.protocols.mrm_scans import Scan, ScanAssembler, split_scan
 from caneflow.protocols.mrm_serial import SerialDeframer, framed
 from caneflow.recording import Recording, RecordingError, RecordingWriter, recover, writer
 from caneflow.recording.layout import MAGIC, MAX_CHUNK, RECORD

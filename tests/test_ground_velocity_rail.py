@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from caneflow.algorithms.radar.moving_returns import MovingReturnsFilter, MovingReturnsSettings, RadarParameters
 from caneflow.algorithms.radar.pulse_pairs import PulsePairWindow, line_phase
 from caneflow.physics import SPEED_OF_LIGHT
-from caneflow.protocols.mrm_scans import Scan, parse_log
+from caneflow.protocols.mrm_logs import parse_log
+from caneflow.protocols.mrm_scans import Scan
 
 Floats = NDArray[np.float64]
 RAIL = Path(__file__).parents[1].parent / "shared" / "data" / "p440-rail-mocap"

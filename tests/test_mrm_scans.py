@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from caneflow.protocols import mrm
 from caneflow.protocols.errors import ProtocolError
+from caneflow.protocols.mrm_logs import parse_log
 from caneflow.protocols.mrm_scans import (
     Scan,
     ScanAssembler,
     milliseconds_after,
-    parse_log,
     range_start,
     range_step,
     split_scan,
@@ -172,6 +172,7 @@ def log_bytes(scans: list[Scan]) -> bytes:
 def test_a_log_that_was_cut_off() -> None:
     scans = [scan(i) for i in range(4)]
     log = parse_log(log_bytes(scans)[:-100])
+    assert log.config is not None
     assert log.config.scan_stop_ps == 81935
     assert [s.message_id for s in log.scans] == [0, 1, 2]
     assert log.bytes_left == 1352
@@ -217,6 +218,8 @@ def test_recorded_logs(name: str, scans: int, samples: int, incomplete: int) -> 
     assert [s.samples.shape for s in log.scans] == [(samples,)] * scans
     assert log.counts.incomplete_scans == incomplete
     assert log.bytes_left == 0
+    assert log.config is not None
+    assert log.damage == ()
     assert {s.scan_start_ps for s in log.scans} == {log.config.scan_start_ps}
     # Every packet is accounted for: a scan has as many as its samples fill.
     in_scans = scans * -(-samples // 350)

@@ -23,7 +23,8 @@ from caneflow.messages import RadarFrame, decode, numbered
 from caneflow.messages.rig import read_rig
 from caneflow.protocols import mrm
 from caneflow.protocols.mrm_emulator import Faults, Moment, RadarEmulator, moments_of_log
-from caneflow.protocols.mrm_scans import Scan, ScanAssembler, parse_log, range_start, range_step, split_scan
+from caneflow.protocols.mrm_logs import parse_log
+from caneflow.protocols.mrm_scans import Scan, ScanAssembler, range_start, range_step, split_scan
 from caneflow.protocols.mrm_serial import SerialDeframer, framed
 from caneflow.runtime import Context, Quiet
 from caneflow.runtime.errors import DataflowError

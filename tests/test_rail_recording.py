@@ -13,7 +13,8 @@ import pytest
 from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
 from caneflow.algorithms.radar.background import Background
 from caneflow.algorithms.radar.range_doppler import bin_of_range, hann, range_doppler_map, speed_of_bin
-from caneflow.protocols.mrm_scans import Scan, parse_log
+from caneflow.protocols.mrm_logs import parse_log
+from caneflow.protocols.mrm_scans import Scan
 
 RAIL = Path(__file__).parents[1].parent / "shared" / "data" / "p440-rail-mocap"
 REFLECTORS = ((2.204, 0.038, -3.874), (2.329, 0.040, 1.038))  # m, x y z of the optical frame, y up

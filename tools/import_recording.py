@@ -6,18 +6,24 @@ from pathlib import Path
 from statistics import median
 from typing import Annotated
 
+import numpy as np
 import typer
 
+from caneflow.algorithms.radar.received_carrier import WINDOW, ReceivedCarrier, received_carrier
 from caneflow.errors import CaneflowError
 from caneflow.messages import NAME, NAME_RULE, RadarFrame, numbered, sample_key
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
 from caneflow.protocols.errors import ProtocolError
-from caneflow.protocols.mrm_scans import Log, Scan, milliseconds_after, parse_log
+from caneflow.protocols.mrm_logs import Log, parse_log
+from caneflow.protocols.mrm_scans import Scan, milliseconds_after
 from caneflow.recording import RecordingWriter
 
 MILLISECOND = 1_000_000  # ns
 RAW = 1  # scan type: neither filtered nor detected
+NOMINAL_CARRIER = 4.3e9  # Hz, the middle of what a P440 transmits
+MEASURED_WINDOWS = 200  # of scans, at most, that the carrier is measured in
+MOST_LOST = 0.01  # of the scans, with status 0
 LONGEST_GAP = 10  # periods: how many scans a longer gap lacks is a guess, so it says nothing of the period
 
 
@@ -26,7 +32,15 @@ def p440(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="REC", help="Recording to write.")],
     flow: Annotated[str, typer.Option(help="Flow under whose name it is recorded.")] = "cane",
     stream: Annotated[str, typer.Option(metavar="NODE/PORT", help="The radar's node and port.")] = "radar/frame",
-    carrier: Annotated[float, typer.Option(min=1, metavar="HZ", help="Hz, centre of the received band.")] = 4.3e9,
+    carrier: Annotated[
+        float | None,
+        typer.Option(
+            min=1,
+            metavar="HZ",
+            help="Hz, effective centre of the received band. Default: measured from echoes that move in the log.",
+            show_default=False,
+        ),
+    ] = None,
     bandwidth: Annotated[float, typer.Option(min=1, metavar="HZ", help="Hz, of the pulse at -10 dB.")] = 1.7e9,
     antenna_delay: Annotated[
         float,
@@ -37,9 +51,10 @@ def p440(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make a recording of a P440's log: its configuration, then MRM_SCAN_INFO packets as they came by UDP.
+    """Make a recording of a P440's log: MRM_SCAN_INFO packets as they came by UDP, or the vendor's lines of text.
 
-    Stamps are the radar's own time, 0 at the first scan. Scans that lack a packet are left out, and counted.
+    Stamps are the radar's own time, 0 at the first scan. Scans that lack a packet are left out, and counted. What is
+    damaged is left out and named; the status is 1 when more than 1 % of the scans are lost with it.
 
     Example: caneflow import p440 scan_2105627.txt -o rail.mcap
     """
@@ -49,6 +64,7 @@ def p440(
         scans = _scans_of_one_radar(log, parsed, source_id)
         stamps = stamps_of([scan.timestamp_ms for scan in scans])
         period = scan_period(stamps)
+        measured = None if carrier else _measured_carrier(scans, stamps)
         with RecordingWriter(recording, flow=flow, source="imported", rig={}) as writer:
             for seq, (stamp, scan) in enumerate(zip(stamps, scans, strict=True)):
                 frame = RadarFrame(
@@ -57,11 +73,18 @@ def p440(
                     scan_period=period,
                     range_start=scan.range_start(1000.0 * antenna_delay),
                     range_step=scan.range_step,
-                    carrier=carrier,
+                    carrier=carrier or (measured.carrier if measured else NOMINAL_CARRIER),
                     bandwidth=bandwidth,
                 )
                 writer.write(key, RadarFrame, numbered(frame, seq), stamp=stamp, seq=seq, log_time=stamp)
+    if not carrier:
+        print(_carrier_line(measured))
+    if parsed.damage:
+        first = parsed.damage[0]
+        print(f"{log}: damaged in {len(parsed.damage)} places, first at {first.place}: {first.reason}")
     print(f"{output}: {len(scans)} scans of {len(scans[0].samples)} samples, {1 / period:.2f} Hz, {_losses(parsed)}")
+    if parsed.damaged_scans > MOST_LOST * (len(parsed.scans) + parsed.damaged_scans):
+        raise typer.Exit(1)
 
 
 def stamps_of(timestamps_ms: Sequence[int]) -> list[int]:
@@ -90,6 +113,25 @@ def scan_period(stamps: Sequence[int]) -> float:
     middle = median(intervals)
     held = [(interval, round(interval / middle)) for interval in intervals if interval < LONGEST_GAP * middle]
     return sum(interval for interval, _ in held) / sum(count for _, count in held) / 1e9
+
+
+def _measured_carrier(scans: Sequence[Scan], stamps: Sequence[int]) -> ReceivedCarrier | None:
+    """From the scans that have the shape of the first; None where nothing moves enough."""
+    shape = (scans[0].scan_start_ps, len(scans[0].samples))
+    alike = [index for index, scan in enumerate(scans) if (scan.scan_start_ps, len(scan.samples)) == shape]
+    samples = np.stack([scans[index].samples for index in alike]).astype(np.float32)
+    times = np.array([stamps[index] for index in alike]) / 1e9
+    hop = max(len(alike) // MEASURED_WINDOWS, WINDOW // 4)
+    return received_carrier(samples, times, scans[0].range_step, hop=hop)
+
+
+def _carrier_line(measured: ReceivedCarrier | None) -> str:
+    if measured is None:
+        return f"carrier: {NOMINAL_CARRIER / 1e9:g} GHz, the nominal one: too little moves to measure it; see --carrier"
+    giga = [value / 1e9 for value in (measured.carrier, measured.error, measured.spread)]
+    return (
+        f"carrier: {giga[0]:.3f} +- {giga[1]:.3f} GHz, measured on {measured.echoes} moving echoes (sd {giga[2]:.3f})"
+    )
 
 
 def _parsed(log: Path) -> Log:
@@ -124,6 +166,9 @@ def _losses(parsed: Log) -> str:
     parts = [f"{counts.incomplete_scans} incomplete ones left out"]
     if counts.restarts:
         parts.append(f"{counts.restarts} restarts of the radar's clock")
+    if parsed.damage:
+        size = sum(each.size for each in parsed.damage)
+        parts.append(f"{parsed.damaged_scans} lost with {size} damaged bytes")
     if parsed.bytes_left:
         parts.append(f"{parsed.bytes_left} bytes of a cut packet at the end")
     return ", ".join(parts)

@@ -1,4 +1,4 @@
-"""Scans of a P440: put together from packets, taken apart into packets, read from logs, with their range axis."""
+"""Scans of a P440: put together from packets, taken apart into packets, with their range axis."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caneflow.physics import SPEED_OF_LIGHT
-from caneflow.protocols.errors import ProtocolError
-from caneflow.protocols.mrm import SAMPLES_PER_PACKET, SCAN_INFO_BYTES, RadarConfig, ScanInfo, parse
+from caneflow.protocols.mrm import SAMPLES_PER_PACKET, ScanInfo
 
 BIN_SECONDS = 1e-9 / (512 * 1.024)  # s, the radar's finest step of delay
 ANTENNA_DELAY_PS = 10_000  # ps, path from the module to the stock antennas and back
@@ -272,40 +271,3 @@ def _is_after(key: ScanKey, other: ScanKey) -> bool:
 
 def _wrapped_difference(later: int, earlier: int, span: int) -> int:
     return (later - earlier + span // 2) % span - span // 2
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Log:
-    """A recorded log: how the radar was set, its complete scans, and what was lost."""
-
-    config: RadarConfig
-    scans: tuple[Scan, ...]
-    counts: AssemblyCounts
-    bytes_left: int  # of a last packet that was cut off
-
-
-def parse_log(data: bytes) -> Log:
-    """The log in `data`: a 32-byte configuration block, then SCAN_INFO payloads of 1452 bytes each.
-
-    Raises:
-        ProtocolError: no configuration block, or something else than SCAN_INFO where one should begin.
-    """
-    config = RadarConfig.from_bytes(data)
-    assembler = ScanAssembler()
-    scans: list[Scan] = []
-    whole = (len(data) - LOG_HEAD_BYTES) // SCAN_INFO_BYTES
-    end = LOG_HEAD_BYTES + whole * SCAN_INFO_BYTES
-    for offset in range(LOG_HEAD_BYTES, end, SCAN_INFO_BYTES):
-        scans += assembler.feed(_packet_at(data, offset))
-    scans += assembler.finish()
-    return Log(config=config, scans=tuple(scans), counts=assembler.counts, bytes_left=len(data) - end)
-
-
-def _packet_at(data: bytes, offset: int) -> ScanInfo:
-    try:
-        packet = parse(data[offset : offset + SCAN_INFO_BYTES])
-    except ProtocolError as error:
-        raise ProtocolError(f"log, byte {offset}: {error}") from error
-    if not isinstance(packet, ScanInfo):
-        raise ProtocolError(f"log, byte {offset}: a {type(packet).__name__}, where a log has ScanInfo only")
-    return packet
