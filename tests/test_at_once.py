@@ -13,7 +13,7 @@ import zenoh
 from caneflow.messages import GroundSpeed, Imu, Sample, numbered
 from caneflow.messages.control import Again, PortMark, Progress
 from caneflow.runtime import Emitted, Operator
-from caneflow.runtime.hosts.process import inputs, process, recovery, reports
+from caneflow.runtime.hosts.process import inputs, process, quickness, recovery, reports
 from caneflow.runtime.hosts.process.events import (
     Arrived,
     AskEnded,
@@ -117,7 +117,7 @@ class Bus:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (process, inputs, recovery, reports):
+    for module in (process, inputs, quickness, recovery, reports):
         monkeypatch.setattr(module, "time", clock)
     return clock
 
@@ -166,7 +166,7 @@ def test_a_reader_that_waits_hears_at_once_that_nothing_follows_from_a_sample(ma
 
 def test_a_slow_one_is_left_to_its_own_thread_for_good(made: Any) -> None:
     host, _, echo = made()
-    echo.takes = 1.01 * process.QUICK
+    echo.takes = 1.01 * quickness.QUICK
     taken = sum(host.take_at_once(arrival(seq)) for seq in range(2 * TIMES))
     assert 1 < taken < TIMES // 2, "some slow ones are forgiven, not many"
     echo.takes = 0.0
@@ -175,13 +175,13 @@ def test_a_slow_one_is_left_to_its_own_thread_for_good(made: Any) -> None:
 
 def test_one_that_the_machine_keeps_waiting_is_not_slow(made: Any) -> None:
     host, _, echo = made()
-    echo.waits = 0.9 * process.STALLED
+    echo.waits = 0.9 * quickness.STALLED
     assert all(host.take_at_once(arrival(seq)) for seq in range(10 * TIMES))
 
 
 def test_one_that_waits_for_long_is_left_to_its_own_thread(made: Any) -> None:
     host, _, echo = made()
-    echo.waits = 1.1 * process.STALLED
+    echo.waits = 1.1 * quickness.STALLED
     assert sum(host.take_at_once(arrival(seq)) for seq in range(2 * TIMES)) < TIMES // 2
 
 
@@ -210,7 +210,7 @@ def test_no_sample_waits_for_the_disk_that_a_snapshot_goes_to(made: Any, clock: 
 def test_one_slow_event_in_five_is_forgiven(made: Any) -> None:
     host, _, echo = made()
     for seq in range(10 * TIMES):
-        echo.takes = 10 * process.QUICK if seq % 5 == 0 else 0.0
+        echo.takes = 10 * quickness.QUICK if seq % 5 == 0 else 0.0
         assert host.take_at_once(arrival(seq))
 
 
@@ -226,7 +226,7 @@ def test_what_an_operator_raises_is_raised_on_the_nodes_own_thread(made: Any) ->
 
 def test_in_a_replay_however_slow_it_is_samples_are_taken_at_once_and_nothing_else(made: Any) -> None:
     host, bus, echo = made(replay=True)
-    echo.takes = 10 * process.QUICK
+    echo.takes = 10 * quickness.QUICK
     for seq in range(2 * TIMES):
         assert host.take_at_once(arrival(seq))
     assert len(bus.sent) == 2 * TIMES

@@ -162,6 +162,14 @@ class Group:
         self._next = 0
         return None
 
+    def writer(self, node: str) -> Feed | Stage:
+        """The stage of a member that sends."""
+        if node in self.feeds:
+            return self.feeds[node]
+        stage = self.readers[node]
+        assert isinstance(stage, Stage)
+        return stage
+
     def local_ports(self, node: str) -> list[str]:
         """The ports of a member that other members write to."""
         return [port for port, wire in self._plans[node].inputs.items() if wire.writer in self._plans]

@@ -6,14 +6,16 @@ import time
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import TypeAlias
 
 from caneflow.runtime.hosts.process.outputs import Outputs
-from caneflow.runtime.hosts.process.recovery import LIVE_SNAPSHOT_PERIOD, SNAPSHOT_PERIOD
+from caneflow.runtime.hosts.process.recovery import LIVE_SNAPSHOT_PERIOD, SNAPSHOT_PERIOD, Recovery
 from caneflow.runtime.plan import ProcessPlan
 from caneflow.runtime.stages.byte_budget import weight
 from caneflow.runtime.stages.group import Group
 from caneflow.runtime.stages.group_snapshot import GroupState
 from caneflow.runtime.stages.journal import Brought, Journal
+from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.sink_stage import Tap
 from caneflow.runtime.stages.snapshot_file import SnapshotFile
@@ -147,3 +149,23 @@ class GroupRecovery:
         self._file.discard()
         if self._journal is not None:
             self._journal.forget(self._journal.number + 1)
+
+
+AnyRecovery: TypeAlias = Recovery | GroupRecovery
+
+
+def recoveries(
+    plan: ProcessPlan,
+    group: Group,
+    outputs: Mapping[str, Outputs],
+    snapshots: Path,
+    lock: AbstractContextManager[object],
+) -> dict[str, AnyRecovery]:
+    """By node what keeps its state: one for the whole of a group, one for a single operator, none for a sink."""
+    if plan.is_group:
+        return dict.fromkeys(plan.members, GroupRecovery(plan, group, outputs, snapshots, lock))
+    return {
+        name: Recovery(plan.members[name], stage, outputs[name], snapshots, lock)
+        for name, stage in group.readers.items()
+        if isinstance(stage, Stage)
+    }

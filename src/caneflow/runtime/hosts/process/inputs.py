@@ -11,6 +11,7 @@ from caneflow.runtime.hosts.process.bus import Bus
 from caneflow.runtime.hosts.process.events import Arrived, HistoryAnswered
 from caneflow.runtime.hosts.process.present import Present
 from caneflow.runtime.hosts.process.recent_delays import RecentDelays
+from caneflow.runtime.hosts.process.reports import REPORT_PERIOD
 from caneflow.runtime.plan import InputPlan, NodePlan, ProcessPlan
 from caneflow.runtime.stages.byte_budget import WAITING
 from caneflow.runtime.stages.group import Group
@@ -21,6 +22,19 @@ ASK_PERIOD = 0.3  # s between two requests for samples that have not come
 LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run, while their writer sends and does not answer
 SILENT_PATIENCE = 10.0  # s, likewise, while it does neither: it may be busy, and nothing else comes that has to wait
 REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
+
+
+LIVE_LOOK_PERIOD = 0.1  # s after which a live process looks at what is due by time, though nothing came
+LOOKS_PER_LAG = 5  # and so often within the time that it may wait for an input
+
+
+def look_period(plan: ProcessPlan) -> float:
+    """How often (s) a process looks at what is due by time."""
+    if plan.replay:
+        return REPORT_PERIOD
+    wires = [wire for node in plan.nodes for wire in node.inputs.values()]
+    lags = [wire.max_lag_ms for wire in wires if wire.max_lag_ms is not None]
+    return max(min([LIVE_LOOK_PERIOD, *(1e-3 * lag / LOOKS_PER_LAG for lag in lags)]), REPORT_PERIOD / 4)
 
 
 @dataclass
