@@ -33,6 +33,8 @@ GRAPHS = {  # what `caneflow bench` is told, by graph
 FLEET = 12  # walks
 COMPUTED = (4, 8, 16, 64)  # workers, beyond the two that are measured
 STARTS = 9
+LATEST_MS = 25.0  # from stamp to recorded pose, the 99th percentile up to which a machine holds its canes
+MOST_CANES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,7 @@ class Found:
     times_real_time: dict[str, list[float]]  # by graph
     start_up: list[float]  # s
     canes: dict[int, list[dict[str, object]]]  # by number
+    held: dict[str, list[int]]  # by what a cane's nodes share: how many canes the machine holds
     fleet: Fleet
 
 
@@ -68,6 +71,7 @@ def main() -> None:
             times_real_time={graph: [times_real_time(walk, more) for _ in repeats] for graph, more in GRAPHS.items()},
             start_up=[start_up(DATAFLOW, walk, Path(folder) / "out.mcap") for _ in range(STARTS)],
             canes={number: [side_by_side(walk, number) for _ in repeats] for number in options.canes},
+            held={layout: [most_canes(walk, layout) for _ in repeats] for layout in canes.LAYOUTS},
             fleet=fleet(Path(folder), len(repeats)),
         )
         page = "\n".join(written(found, options.repeats))
@@ -84,10 +88,24 @@ def times_real_time(walk: Path, more: Sequence[str]) -> float:
     return float(json.loads(done.stdout)["times_real_time"])
 
 
-def side_by_side(walk: Path, number: int) -> dict[str, object]:
+def side_by_side(walk: Path, number: int, layout: str = "five processes") -> dict[str, object]:
     """So many canes, live."""
     with tempfile.TemporaryDirectory() as folder:
-        return canes.measured(Path(folder), canes.graph(walk, "best"), number, seconds=20.0)
+        return canes.measured(Path(folder), canes.graph(walk, "best", layout), number, seconds=20.0)
+
+
+def most_canes(walk: Path, layout: str) -> int:
+    """How many canes this machine holds with nothing lost and no pose late: one more at a time, until it fails."""
+    held = 0
+    while held < MOST_CANES and holds(side_by_side(walk, held + 1, layout)):
+        held += 1
+    return held
+
+
+def holds(run: Mapping[str, object]) -> bool:
+    """Whether nothing was lost in a run, and hardly a pose was late."""
+    ages = run["stamp_to_recorded_pose_ms"]
+    return isinstance(ages, dict) and ages["p99"] <= LATEST_MS and not (run["losses_said"] or run["poses_missing"])
 
 
 def fleet(folder: Path, repeats: int) -> Fleet:
@@ -137,6 +155,9 @@ def written(found: Found, repeats: int) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     for number, runs in found.canes.items():
         yield f"| {number} | {' | '.join(cane_figures(runs))} |"
+    yield f"\n| a cane's nodes | canes that the machine holds: nothing lost, p99 at most {LATEST_MS:g} ms |\n|---|---|"
+    for layout, numbers in found.held.items():
+        yield f"| {layout} | **{statistics.median(numbers):g}** {spread(numbers)} |"
     yield from fleet_table(found.fleet)
 
 

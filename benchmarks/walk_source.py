@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass
 from itertools import count
+from typing import Literal
 
 import msgspec
 
@@ -19,6 +20,7 @@ class WalkSettings:
     """Which walk."""
 
     recording: str
+    plays: Literal["imu", "frame", "both"] = "both"
 
 
 class Walk(Source):
@@ -29,7 +31,8 @@ class Walk(Source):
 
     def __init__(self, settings: WalkSettings, context: Context) -> None:
         with Recording(settings.recording) as recording:
-            self._samples = [(s.stamp, STREAMS[s.node, s.port], s.decoded()) for s in recording.samples(STREAMS)]
+            streams = {stream: port for stream, port in STREAMS.items() if settings.plays in (port, "both")}
+            self._samples = [(s.stamp, streams[s.node, s.port], s.decoded()) for s in recording.samples(streams)]
 
     def samples(self) -> Brought:
         """Yield each when it is due; its stamp is the instant at which it leaves."""

@@ -43,10 +43,13 @@ def test_the_graphs_that_grow(chain: int, fan: int, tmp_path: Path, monkeypatch:
     assert len(graph.wires) == point.hops
 
 
-def test_the_graph_of_a_cane_that_plays_a_walk(tmp_path: Path) -> None:
+@pytest.mark.parametrize("layout", canes.LAYOUTS)
+def test_the_graph_of_a_cane_that_plays_a_walk(tmp_path: Path, layout: str) -> None:
     file = tmp_path / "cane.yaml"
-    file.write_text(canes.graph(Path("walk.mcap"), "best").replace("{number}", "1"))
-    assert set(load(file).nodes) == {"walk", "ground_speed", "fusion"}
+    file.write_text(canes.graph(Path("walk.mcap"), "best", layout).replace("{number}", "1"))
+    nodes = load(file).nodes
+    assert set(nodes) == {"imu", "radar", "ground_speed", "fusion"}
+    assert len({node.process for node in nodes.values()}) == 1
 
 
 def test_a_fleet_is_computed_from_its_work_until_collecting_it_takes_longer() -> None:

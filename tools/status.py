@@ -83,6 +83,8 @@ def _node(node: NodeStatus) -> tuple[str, ...]:
     cpu = "-" if node.cpu is None else f"{100 * node.cpu:.1f} %"
     memory = "-" if node.memory is None else f"{node.memory / 1e6:.0f} MB"
     sent = ", ".join(f"{port} {number}{_at_rate(node.rates[port])}" for port, number in node.sent.items())
+    if node.process:  # the first node of a process shows what that costs
+        cpu, memory = (f"in {node.process}", "") if node.cpu is None else (f"{node.process}: {cpu}", memory)
     state = node.state
     if node.counted is not None and node.counted > STALE:
         state += f", silent {span(node.counted)}"

@@ -115,7 +115,7 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     rates: dict[str, float | None]  # Hz, by output port
     counted: float | None  # s since it last said its counters; None: never yet
     said: str  # the last line that it wrote
-    process: str = ""  # the name of its process, when other nodes share it; `cpu` and `memory` are all of that
+    process: str = ""  # the name of its process, when others share it: its `cpu` and `memory` stand with the first
     listen: tuple[str, ...] = ()  # Zenoh endpoints
     machine: str = ""  # its name in the file; "" when the flow has only one
     connect: tuple[str, ...] = ()  # whom it dials: its launcher, and the writers of its inputs

@@ -27,12 +27,17 @@ class Group:
         plans: Mapping[str, NodePlan],
         received: Callable[[str, str, Sample], int],
         working: Callable[[str], None] | None = None,
+        *,
+        spares_marks: bool = False,
     ) -> None:
         """The members to be; `add` each.
 
         `received`: the time (ns) at which a node takes a sample on a port. `working`: is told whose turn it is.
+        `spares_marks`: those that say no more than the samples pass only when `tell_all_marks` asks for it.
         """
         self._working = working
+        self._spares_marks = spares_marks
+        self._tells_all = True
         self.feeds: dict[str, Feed] = {}
         self.readers: dict[str, Reader] = {}  # writers before their readers
         self.held: set[str] = set()  # those that handle nothing: what they have sent has to be taken first
@@ -143,7 +148,7 @@ class Group:
         """
         if self._next == 0:
             for name, feed in self.feeds.items():
-                if name in self._heard:
+                if name in self._heard and (self._passes_all or feed.tells_more_than_samples()):
                     self._pass_marks(name, feed)
         while self._next < len(self._steps):
             name, reader = self._steps[self._next]
@@ -156,11 +161,20 @@ class Group:
                 if (emitted := reader.step(now)) is not None:
                     self._spread_all(name, emitted)
                     return name, emitted
-                if name in self._heard:
+                if name in self._heard and (self._passes_all or reader.finished or reader.tells_more_than_samples()):
                     self._pass_marks(name, reader)
             self._next += 1
         self._next = 0
+        self._tells_all = False
         return None
+
+    def tell_all_marks(self) -> None:
+        """Let the next round of `step` pass all marks between members."""
+        self._tells_all = True
+
+    @property
+    def _passes_all(self) -> bool:
+        return self._tells_all or not self._spares_marks
 
     def writer(self, node: str) -> Feed | Stage:
         """The stage of a member that sends."""

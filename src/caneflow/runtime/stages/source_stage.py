@@ -76,6 +76,10 @@ class Feed:
         }
         return Progress(self.node, min((mark.watermark for mark in marks.values()), default=END), marks)
 
+    def tells_more_than_samples(self) -> bool:
+        """Whether a reader cannot see from the samples alone how far the source has come."""
+        return self.ended or any(out.last_stamp < self._quiet for out in self.outputs.values())
+
     def state(self) -> FeedState:
         """Where the streams stand."""
         return FeedState({port: (out.sent, out.last_stamp) for port, out in self.outputs.items()}, self._quiet)

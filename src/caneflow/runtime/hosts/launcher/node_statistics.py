@@ -148,8 +148,9 @@ class NodeStatistics:
     def _node(
         self, name: str, node: ObservedNode, now: float, machine: str, nodes: Mapping[str, ObservedNode]
     ) -> NodeStatus:
-        shared = any(other.plan.runs_in == node.plan.runs_in and other is not node for other in nodes.values())
-        counted, cost = self._counted.get(name), self._costs.get(node.pid)
+        members = [other for other in nodes.values() if other.plan.runs_in == node.plan.runs_in]
+        cost = self._costs.get(node.pid) if members[0] is node else None  # it belongs to the process
+        counted = self._counted.get(name)
         sent = dict(counted.now.outputs) if counted else {}
         rates = {port: self._sent_rate(name, port) for port in node.plan.outputs}
         said = node.last_line
@@ -170,7 +171,7 @@ class NodeStatistics:
             rates=rates,
             counted=now - counted.at if counted else None,
             said=said,
-            process=node.plan.process if shared else "",
+            process=node.plan.runs_in if len(members) > 1 else "",
             machine=machine,
             listen=node.plan.links.listen,
             connect=node.plan.links.connect,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from caneflow.runtime.hosts.process.outputs import Outputs
-from caneflow.runtime.hosts.process.recovery import LIVE_SNAPSHOT_PERIOD, SNAPSHOT_PERIOD, Recovery
+from caneflow.runtime.hosts.process.recovery import SNAPSHOT_PERIOD, Recovery
 from caneflow.runtime.plan import ProcessPlan
 from caneflow.runtime.stages.byte_budget import weight
 from caneflow.runtime.stages.group import Group
@@ -22,6 +22,8 @@ from caneflow.runtime.stages.snapshot_file import SnapshotFile
 from caneflow.runtime.wording import one_line
 
 log = logging.getLogger(__name__)
+
+LIVE_GROUP_PERIOD = 4.0  # s between two snapshots, live: all operators are packed at once, and caught up within 0.1 s
 
 
 class GroupRecovery:
@@ -50,7 +52,7 @@ class GroupRecovery:
         self._since_snapshot = 0  # bytes of samples that came from other processes
         self._keeps = True  # the last snapshot could be kept
         self._on_trial = False  # a snapshot was gone on from, and none was kept since
-        self._period = SNAPSHOT_PERIOD if plan.replay else LIVE_SNAPSHOT_PERIOD
+        self._period = SNAPSHOT_PERIOD if plan.replay else LIVE_GROUP_PERIOD
         self._next = time.monotonic() + self._period
         self._last: object = None  # where the streams stood at the last snapshot
         self.ended = False

@@ -11,7 +11,7 @@ from caneflow.runtime.hosts.process.bus import Bus
 from caneflow.runtime.hosts.process.events import Arrived, HistoryAnswered
 from caneflow.runtime.hosts.process.present import Present
 from caneflow.runtime.hosts.process.recent_delays import RecentDelays
-from caneflow.runtime.hosts.process.reports import REPORT_PERIOD
+from caneflow.runtime.hosts.process.reports import LIVE_REPORT_PERIOD, REPORT_PERIOD
 from caneflow.runtime.plan import InputPlan, NodePlan, ProcessPlan
 from caneflow.runtime.stages.byte_budget import WAITING
 from caneflow.runtime.stages.group import Group
@@ -34,6 +34,8 @@ def look_period(plan: ProcessPlan) -> float:
         return REPORT_PERIOD
     wires = [wire for node in plan.nodes for wire in node.inputs.values()]
     lags = [wire.max_lag_ms for wire in wires if wire.max_lag_ms is not None]
+    if not (lags or plan.arriving):
+        return LIVE_REPORT_PERIOD
     return max(min([LIVE_LOOK_PERIOD, *(1e-3 * lag / LOOKS_PER_LAG for lag in lags)]), REPORT_PERIOD / 4)
 
 

@@ -47,7 +47,7 @@ class Process:
     ) -> None:
         self.plan = plan
         self.bus = bus
-        self.group = Group(plan.members, received=self._received_locally, working=speak_for)
+        self.group = Group(plan.members, self._received_locally, speak_for, spares_marks=True)
         for name, program in built.items():
             self.group.add(plan.members[name], program)
         self.stages = {name: each for name, each in self.group.readers.items() if isinstance(each, Stage)}
@@ -105,6 +105,7 @@ class Process:
                 if not came:
                     for tap in self.taps.values():
                         tap.idle(time.time_ns())
+                self.group.tell_all_marks()
                 more = self.handle_what_is_due()
                 self.ask_for_missing()
                 self.wait_no_longer_than_allowed()
