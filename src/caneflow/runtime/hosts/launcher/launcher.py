@@ -30,7 +30,7 @@ from caneflow.runtime.hosts.launcher.replay_progress import ReplayProgress
 from caneflow.runtime.hosts.launcher.replay_window import ReplayWindow
 from caneflow.runtime.hosts.launcher.requests import RestartAsked, requests
 from caneflow.runtime.hosts.launcher.restarts import How
-from caneflow.runtime.hosts.launcher.run_directory import RunDirectory, remove_state_folder, state_folder
+from caneflow.runtime.hosts.launcher.run_directory import LOST, RunDirectory, remove_state_folder, state_folder
 from caneflow.runtime.hosts.launcher.run_log import RunLog
 from caneflow.runtime.hosts.launcher.starting import plan_to_start, program_arguments
 from caneflow.runtime.hosts.launcher.stop_signals import Interrupted, stop_signals
@@ -278,12 +278,9 @@ class Launcher:
         """Say once that the folder of the run was removed, as cleaners do: links that are there go on."""
         if not (self._said_removed or self._directory.is_there):
             self._said_removed = True
-            lost = (
-                "tools cannot attach any more, and a node that ends cannot start again"
-                if self._deployment.links == "unix"
-                else "tools cannot find it by its name any more"
+            self._say(
+                LAUNCHER, f"{self._directory.path} was removed: the flow goes on, but {LOST[self._deployment.links]}"
             )
-            self._say(LAUNCHER, f"{self._directory.path} was removed: the flow goes on, but {lost}")
 
     def _look_at_deadlines(self) -> None:
         now = time.monotonic()
@@ -347,10 +344,7 @@ class Launcher:
                     self._nodes.take_said(said)
 
     def _conclude(self) -> None:
-        for node in self._nodes.here:
-            if node.spare and (node.failing_since is not None or node.last_words is not None):
-                incomplete = f"{node.plan.node}: the recording is incomplete: {node.last_line}"
-                self._outcome.unrecorded.append(incomplete)
+        self._outcome.unrecorded += self._nodes.unrecorded
         self._outcome.counters = self._nodes.counters
         if self._deployment.replay and not self._outcome.interrupted:
             failures, self._outcome.failures = self._outcome.failures, []

@@ -115,6 +115,12 @@ class Nodes:
         return sources, operators, sinks
 
     @property
+    def unrecorded(self) -> list[str]:
+        """Why the recording of a live flow is incomplete, at the end."""
+        failed = [node for node in self.here if node.spare and (node.failing_since is not None or node.last_words)]
+        return [f"{node.plan.node}: the recording is incomplete: {node.last_line}" for node in failed]
+
+    @property
     def counters(self) -> dict[str, Counters]:
         """The last that each said it counted."""
         return {node.plan.node: node.counters for node in self if node.counters is not None}

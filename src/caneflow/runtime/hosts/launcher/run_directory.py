@@ -31,6 +31,10 @@ OTHERS_WRITE = 0o002
 TCP = re.compile(r"tcp/127\.0\.0\.1:([0-9]{1,5})")
 OF_YOUR_OWN = "set XDG_RUNTIME_DIR to a folder of your own"
 OF_PROCESS = re.compile(r".*-([0-9]{1,10})")  # the name of a run folder, with the launcher's pid
+LOST = {  # with the folder of a run, by the kind of its links
+    "unix": "tools cannot attach any more, and a node that ends cannot start again",
+    "tcp": "tools cannot find it by its name any more",
+}
 
 
 class RunningFlow(msgspec.Struct, frozen=True):

@@ -102,9 +102,8 @@ class Process:
             came = self.take_events(timeout=0 if more else self.look_period)
             with self.lock:
                 self.raise_if_broken()
-                if not came:
-                    for tap in self.taps.values():
-                        tap.idle(time.time_ns())
+                for tap in () if came else self.taps.values():
+                    tap.idle(time.time_ns())
                 self.group.tell_all_marks()
                 more = self.handle_what_is_due()
                 self.ask_for_missing()
