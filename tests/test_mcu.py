@@ -400,7 +400,7 @@ def test_other_settings_agree_as_well(tmp_path: Path, settings: LuenbergerSettin
     flow = tmp_path / "flow.yaml"
     about = {key: value for key, value in vars(settings).items() if value is not None}
     about["gain"] = [list(row) for row in settings.gain] if settings.gain else None
-    text = (ROOT / "dataflow.yaml").read_text()
+    text = (ROOT / "dataflows" / "paper.yaml").read_text()
     flow.write_text(text.replace("{ method: luenberger }", f"{{ luenberger: {msgspec.json.encode(about).decode()} }}"))
     command = [str(built("host", tmp_path, f"FLOW={flow}", "SANITIZE=-O0"))]
     for samples in (walk(), hostile(200, 3)):
