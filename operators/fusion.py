@@ -1,8 +1,10 @@
 """Position by dead reckoning: the radar's speed over ground along the IMU's heading, by the method of choice.
 
 in   imu   : Imu          orientation, linear acceleration, gyro, 100 Hz
-in   speed : GroundSpeed  one per radar frame, 100 Hz; not wired: shs and naive_ins work without
+in   speed : GroundSpeed  one per radar frame, 100 Hz; shs, naive_ins and zero_velocity need none
 out  pose  : Pose         one per IMU sample
+
+`zero_velocity` is for an IMU on a foot: it takes raw gyro and accelerometer, and no orientation.
 """
 
 from dataclasses import dataclass, field
@@ -16,16 +18,22 @@ from caneflow.algorithms.cane.luenberger_fixed import FixedLuenbergerObserver, o
 from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
 from caneflow.algorithms.cane.speed_gate import CaneGlitchSettings, SpeedGate
 from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettings
+from caneflow.algorithms.cane.zero_velocity import ZeroVelocity, ZeroVelocitySettings
 from caneflow.algorithms.glitches import GlitchGate, Readings
-from caneflow.algorithms.inertial.imu_sample import require_later, required_acceleration, required_orientation
+from caneflow.algorithms.inertial.imu_sample import (
+    require_later,
+    required_acceleration,
+    required_force,
+    required_orientation,
+)
 from caneflow.algorithms.radar.ground_velocity import UNOBSERVED
 from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.node import run
 
-Method: TypeAlias = Literal["luenberger", "luenberger_fixed", "kalman", "shs", "naive_ins", "best"]
-WITHOUT_SPEED = ("shs", "naive_ins")  # methods that an IMU alone is enough for
+Method: TypeAlias = Literal["luenberger", "luenberger_fixed", "kalman", "shs", "naive_ins", "best", "zero_velocity"]
+WITHOUT_SPEED = ("shs", "naive_ins", "zero_velocity")  # methods that an IMU alone is enough for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +46,9 @@ class FusionSettings:
     shs: StepHeadingSettings = field(default_factory=StepHeadingSettings)
     naive_ins: NaiveInsSettings = field(default_factory=NaiveInsSettings)
     best: CaneFilterSettings = field(default_factory=CaneFilterSettings)
-    glitches: CaneGlitchSettings = field(default_factory=CaneGlitchSettings)  # fixed point has their defaults
+    zero_velocity: ZeroVelocitySettings = field(default_factory=ZeroVelocitySettings)
+    # fixed point has their defaults; a foot has its own, zero_velocity.glitches
+    glitches: CaneGlitchSettings = field(default_factory=CaneGlitchSettings)
 
     def __post_init__(self) -> None:
         if self.method == "luenberger_fixed":  # raises for what fixed point does not have
@@ -61,7 +71,8 @@ class Fusion(Operator):
             )
         self._settings, self._rig = settings, context.rig
         self._method = settings.method
-        self._gate = GlitchGate(settings.glitches)
+        on_foot = settings.method == "zero_velocity"
+        self._gate = GlitchGate(settings.zero_velocity.glitches if on_foot else settings.glitches)
         self._speeds, self._velocities = SpeedGate(settings.glitches), SpeedGate(settings.glitches)
         self._held: tuple[str, ...] = ()  # what was held back of speeds since the last pose
         self._samples = 0  # of the IMU; counted until two agree
@@ -70,10 +81,6 @@ class Fusion(Operator):
 
     def _start(self) -> None:
         self._estimator = estimator(self._settings, self._rig)
-        # The paper's methods know one speed; this one knows a velocity and the magnetic field as well.
-        self._cane_filter = self._estimator if isinstance(self._estimator, CaneFilter) else None
-        # It holds wild readings by itself, as the firmware does, which gets samples as they are.
-        self._fixed = self._estimator if isinstance(self._estimator, FixedLuenbergerObserver) else None
 
     def handle(self, port: str, message: Sample) -> Emitted:
         """The pose at an IMU sample's stamp; a speed only informs the estimator."""
@@ -85,13 +92,14 @@ class Fusion(Operator):
 
     def _take_speed(self, ground: GroundSpeed) -> None:
         stamp, velocity, covariance = ground.stamp, ground.velocity, ground.velocity_cov
-        if self._cane_filter is not None and velocity is not None and covariance is not None:
+        if velocity is not None and covariance is not None:
             says_nothing = min(covariance[0], covariance[2]) >= UNOBSERVED
             if says_nothing or self._velocities.passes(stamp, *velocity, ground.velocity_delay):
-                self._cane_filter.velocity(stamp, velocity, covariance, ground.velocity_delay)
+                self._estimator.velocity(stamp, velocity, covariance, ground.velocity_delay)
             else:
                 self._hold("velocity")
-        if self._fixed is not None or not ground.valid or self._speeds.passes(stamp, ground.speed, 0.0, ground.delay):
+        has_gates = self._estimator.has_gates
+        if has_gates or not ground.valid or self._speeds.passes(stamp, ground.speed, 0.0, ground.delay):
             self._estimator.speed(stamp, ground.speed, ground.quality, ground.valid, ground.delay)
         else:
             self._hold("speed")
@@ -106,16 +114,16 @@ class Fusion(Operator):
         except ValueError as error:
             raise Refused(str(error)) from error
         readings = Readings(imu.gyro, imu.accel, imu.mag, imu.orientation, imu.linear_accel)
-        if self._fixed is None:
+        if not self._estimator.has_gates:
             readings = self._gate.update(imu.stamp, readings)
             if self._samples < 2:
                 self._begin()
-        if self._cane_filter is not None and readings.mag is not None:
-            self._cane_filter.magnetic_field(readings.mag)
+        if readings.mag is not None:
+            self._estimator.magnetic_field(readings.mag)
         estimate = self._estimator.imu(
             imu.stamp, readings.gyro, readings.accel, readings.orientation, readings.linear_accel
         )
-        held = self._gate.held + self._held if self._fixed is None else self._fixed.held
+        held = self._estimator.held if self._estimator.has_gates else self._gate.held + self._held
         self._held = ()
         return Pose(
             stamp=imu.stamp,
@@ -130,8 +138,11 @@ class Fusion(Operator):
     def _require(self, imu: Imu) -> None:
         """Raise ValueError for a sample that the method cannot use, before it has changed anything."""
         require_later(imu.stamp, self._last_ns)
-        required_orientation(imu.orientation, self._method)
-        if self._method != "shs":
+        if self._method == "zero_velocity":
+            required_force(imu.accel, self._method)
+        else:
+            required_orientation(imu.orientation, self._method)
+        if self._method not in ("shs", "zero_velocity"):
             required_acceleration(imu.accel, imu.linear_accel, self._method)
         self._last_ns = imu.stamp
 
@@ -156,6 +167,8 @@ def estimator(settings: FusionSettings, rig: Rig) -> DeadReckoning:
             return StepHeading(settings.shs, boresight=rig.boresight, step_length=rig.need("step_length"))
         case "naive_ins":
             return NaiveIns(settings.naive_ins)
+        case "zero_velocity":
+            return ZeroVelocity(settings.zero_velocity)
         case "best":
             return CaneFilter(
                 settings.best,

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.cane.speed_gate import StatedVariance
 from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
@@ -103,7 +103,7 @@ _UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
 _POINTING_TIME: Final = 0.2  # s
 
 
-class CaneFilter:
+class CaneFilter(DeadReckoning):
     """Ground velocities, magnetic field and IMU samples in, one estimate per IMU sample out."""
 
     def __init__(

@@ -3,8 +3,9 @@
 psi is the yaw of the boresight; (cos psi, sin psi) is kept instead of psi, since eq. 5 needs nothing else.
 """
 
+from abc import ABC, abstractmethod
 from collections import deque
-from typing import Literal, NamedTuple, Protocol, TypeAlias
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +28,38 @@ class PoseEstimate(NamedTuple):
     covariance: NDArray[np.float64] | None  # (6, 6) of position and velocity, m^2, m^2/s, m^2/s^2
 
 
-class DeadReckoning(Protocol):
-    """The shape of every fusion method: ground speeds and IMU samples in, one estimate per IMU sample out."""
+class DeadReckoning(ABC):
+    """The shape of every fusion method: ground speeds and IMU samples in, one estimate per IMU sample out.
+
+    A method that derives from it need not say that it has no use for speeds, velocities or the magnetic field.
+    """
+
+    has_gates: ClassVar[bool] = False  # wild readings are held in it, and it wants them as they come
+    held: tuple[str, ...] = ()  # what it held back of the last sample, when it has gates
 
     @property
+    @abstractmethod
     def gaps(self) -> int:
         """How many intervals between IMU samples were longer than LONGEST_INTERVAL."""
 
-    def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
+    def speed(  # noqa: B027 - some methods have no use for it, and for the two that follow
+        self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None
+    ) -> None:
         """Take a new ground speed: m/s, its quality in m/s, and the s by which it lags its stamp."""
 
+    def velocity(  # noqa: B027
+        self,
+        stamp_ns: int,
+        velocity: tuple[float, float],
+        covariance: tuple[float, float, float],
+        delay: float | None,
+    ) -> None:
+        """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
+
+    def magnetic_field(self, mag: Vector) -> None:  # noqa: B027
+        """Take the field (uT, body frame) of the IMU sample that comes next."""
+
+    @abstractmethod
     def imu(
         self,
         stamp_ns: int,

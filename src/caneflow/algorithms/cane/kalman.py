@@ -11,7 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane.dead_reckoning import DelayCompensation, GroundVelocity, PoseEstimate, VelocityMeasurement
+from caneflow.algorithms.cane.dead_reckoning import (
+    DeadReckoning,
+    DelayCompensation,
+    GroundVelocity,
+    PoseEstimate,
+    VelocityMeasurement,
+)
 from caneflow.algorithms.inertial.imu_sample import (
     LONGEST_INTERVAL,
     SampleClock,
@@ -131,7 +137,7 @@ class SlowError:
         return mx * jx, mx * jy, my * jx, my * jy
 
 
-class KalmanFilter:
+class KalmanFilter(DeadReckoning):
     """One state (a, v) per axis of R0 and one covariance for all; predicts from IMU sample to IMU sample.
 
     As in eq. 9 the sample k corrects the state at k, and what is given out at k+1 is the prediction from it.

@@ -9,7 +9,7 @@ from typing import Annotated, TypeAlias
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from caneflow.algorithms.cane.dead_reckoning import DelayCompensation, GroundVelocity, PoseEstimate
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, DelayCompensation, GroundVelocity, PoseEstimate
 from caneflow.algorithms.inertial.imu_sample import (
     LONGEST_INTERVAL,
     SampleClock,
@@ -62,7 +62,7 @@ def observer_eigenvalues(gain: Gain, interval: float) -> tuple[complex, complex]
     return 0.5 * trace + root, 0.5 * trace - root
 
 
-class LuenbergerObserver:
+class LuenbergerObserver(DeadReckoning):
     """One state (a, v) per axis of R0, advanced from IMU sample to IMU sample.
 
     x(k+1) = A x(k) + L (y(k) - C x(k)), p(k+1) = p(k) + T v(k+1), with T the measured interval (row 11).

@@ -15,7 +15,7 @@ from binascii import crc32
 from collections import deque
 from typing import Final, NamedTuple, TypeAlias
 
-from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.luenberger import LuenbergerSettings
 from caneflow.algorithms.cane.speed_gate import LONGEST_GAP
 from caneflow.algorithms.glitches import JumpGate
@@ -173,7 +173,7 @@ class _Heading(NamedTuple):
     sin: int  # Q1.30
 
 
-class FixedLuenbergerObserver:
+class FixedLuenbergerObserver(DeadReckoning):
     """The observer of algorithms.luenberger in 32-bit states: for each axis of R0 a, v, p and p's remainder.
 
     Takes and gives SI floats, as the other methods do: rounded to the format on the way in, exact on the way out.
@@ -181,6 +181,8 @@ class FixedLuenbergerObserver:
     `held`: what of the last sample, and of the speeds before it, was wild and held back (glitches.py).
     `gaps`: how many intervals were longer than LONGEST_INTERVAL_NS.
     """
+
+    has_gates = True
 
     def __init__(self, settings: LuenbergerSettings, *, boresight: Vector) -> None:
         """Raises ValueError for settings that fixed point does not have, see `observer_constants`."""
@@ -206,13 +208,18 @@ class FixedLuenbergerObserver:
             DELAY_JUMP, _difference, longest_gap=LONGEST_GAP, start=0, unseen_limit=UNSEEN_DELAY
         )
         self._held_speed = False  # since the last estimate
-        self.held: tuple[str, ...] = ()
-        self.gaps = 0  # intervals longer than LONGEST_INTERVAL_NS
+        self.held = ()
+        self._gaps = 0  # intervals longer than LONGEST_INTERVAL_NS
 
     @property
     def states(self) -> tuple[Integers, Integers, Integers]:
         """Acceleration (Q9.22), velocity (Q6.25) and position (Q11.20) in R0."""
         return self._acceleration, self._velocity, self._position
+
+    @property
+    def gaps(self) -> int:
+        """How many intervals between IMU samples were longer than LONGEST_INTERVAL."""
+        return self._gaps
 
     def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
         """Take a new ground speed (m/s); the observer has no use for its quality (m/s)."""
@@ -272,7 +279,7 @@ class FixedLuenbergerObserver:
 
     def _advance(self, stamp_ns: int, interval_ns: int) -> None:
         is_gap = interval_ns > LONGEST_INTERVAL_NS
-        self.gaps += is_gap
+        self._gaps += is_gap
         step = 0 if is_gap else product(interval_ns, NS_TO_STEP, 32)
         ground = self._take(stamp_ns)
         axes = [self._advance_axis(i, step, None if ground is None else ground[i]) for i in range(3)]

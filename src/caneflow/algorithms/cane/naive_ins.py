@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.inertial.imu_sample import SampleClock, required_orientation, world_acceleration
 from caneflow.algorithms.rotations import Quaternion, Vector
 
@@ -12,7 +12,7 @@ class NaiveInsSettings:
     """Nothing to set: that is what makes it naive."""
 
 
-class NaiveIns:
+class NaiveIns(DeadReckoning):
     """Velocity and position by the trapezium rule; the radar is not used. The reference that drifts (Table I)."""
 
     def __init__(self, settings: NaiveInsSettings) -> None:
@@ -25,9 +25,6 @@ class NaiveIns:
     def gaps(self) -> int:
         """How many intervals between IMU samples were longer than LONGEST_INTERVAL; integrated like any other."""
         return self._clock.gaps
-
-    def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
-        """Ground speed is not used."""
 
     def imu(
         self,

@@ -6,7 +6,7 @@ The cane is swung once per step. Between two swings it stands still for an insta
 import math
 from dataclasses import dataclass
 
-from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.inertial.imu_sample import SampleClock, heading_of, required_orientation
 from caneflow.algorithms.quantities import Time, TurnRate
 from caneflow.algorithms.rotations import Quaternion, Vector
@@ -27,7 +27,7 @@ class StepHeadingSettings:
             )
 
 
-class StepHeading:
+class StepHeading(DeadReckoning):
     """One step of fixed length for each swing, along the mean yaw of the boresight during it.
 
     A stationary point is a local minimum of the gyro's norm below `stationary_rate`, at least `shortest_swing`
@@ -51,9 +51,6 @@ class StepHeading:
     def gaps(self) -> int:
         """How many intervals between IMU samples were longer than LONGEST_INTERVAL."""
         return self._clock.gaps
-
-    def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
-        """Ground speed is not used."""
 
     def imu(
         self,

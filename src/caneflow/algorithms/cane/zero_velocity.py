@@ -14,16 +14,17 @@ World: z up, origin and yaw those of the first sample.
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
-from annotated_types import Gt
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
-from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleClock
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
+from caneflow.algorithms.glitches import GlitchSettings
+from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleClock, required_force
 from caneflow.algorithms.inertial.initial_attitude import level
+from caneflow.algorithms.quantities import Acceleration, Angle, Density, Time, TurnRate
 from caneflow.algorithms.rotations import Quaternion, Vector, from_rotation_vector, multiply, normalized, rotate
 from caneflow.physics import GRAVITY
 
@@ -42,26 +43,32 @@ class StanceSettings:
     window, either alone. Skog's noises and threshold, 0.01 m/s^2, 0.1 deg/s and 0.3e5, are 1.7 m/s^2, 17 deg/s.
     """
 
-    window: Annotated[float, Gt(0)] = 0.04  # s; the newest samples
-    accel: Annotated[float, Gt(0)] = 1.7  # m/s^2
-    gyro: Annotated[float, Gt(0)] = math.radians(17.0)  # rad/s
+    window: Time = 0.04  # s; the newest samples
+    accel: Acceleration = 1.7  # m/s^2
+    gyro: TurnRate = math.radians(17.0)  # rad/s
+
+
+def worn_on_a_foot() -> GlitchSettings:
+    """What is wild on a foot, whose heel strikes: 5 g and 360 deg/s from sample to sample are a step at 100 Hz."""
+    return GlitchSettings(acceleration=100.0, turn_rate=math.radians(1000.0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ZeroVelocitySettings:
     """Noises of the sensors and of a standing foot."""
 
-    stance: StanceSettings = StanceSettings()
-    velocity_noise: Annotated[float, Gt(0)] = 0.01  # m/s/sqrt(Hz), of a standing foot, which still rolls a little
-    rest_time: Annotated[float, Gt(0)] = 1.0  # s; a stance that lasts longer is no step: the foot does not turn either
-    turn_noise: Annotated[float, Gt(0)] = math.radians(0.05)  # rad/s/sqrt(Hz), of a foot at rest
-    accel_noise: Annotated[float, Gt(0)] = 0.02  # m/s^2/sqrt(Hz); with what a foot adds: scale, bandwidth, impacts
-    gyro_noise: Annotated[float, Gt(0)] = math.radians(0.02)  # rad/s/sqrt(Hz), likewise
-    accel_bias: Annotated[float, Gt(0)] = 0.1  # m/s^2, sd at the start
-    gyro_bias: Annotated[float, Gt(0)] = math.radians(0.3)  # rad/s, sd at the start
-    accel_bias_walk: Annotated[float, Gt(0)] = 1e-4  # m/s^2/sqrt(s)
-    gyro_bias_walk: Annotated[float, Gt(0)] = math.radians(1e-3)  # rad/s/sqrt(s)
-    tilt: Annotated[float, Gt(0)] = math.radians(1.0)  # rad, sd of the inclination read off the first sample
+    stance: StanceSettings = field(default_factory=StanceSettings)
+    glitches: GlitchSettings = field(default_factory=worn_on_a_foot)  # of accel and gyro; nothing else is used
+    velocity_noise: Density = 0.01  # m/s/sqrt(Hz), of a standing foot, which still rolls a little
+    rest_time: Time = 1.0  # s; a stance that lasts longer is no step: the foot does not turn either
+    turn_noise: Density = math.radians(0.05)  # rad/s/sqrt(Hz), of a foot at rest
+    accel_noise: Density = 0.02  # m/s^2/sqrt(Hz); with what a foot adds: scale, bandwidth, impacts
+    gyro_noise: Density = math.radians(0.02)  # rad/s/sqrt(Hz), likewise
+    accel_bias: Acceleration = 0.1  # m/s^2, sd at the start
+    gyro_bias: TurnRate = math.radians(0.3)  # rad/s, sd at the start
+    accel_bias_walk: Density = 1e-4  # m/s^2/sqrt(s)
+    gyro_bias_walk: Density = math.radians(1e-3)  # rad/s/sqrt(s)
+    tilt: Angle = math.radians(1.0)  # rad, sd of the inclination read off the first sample
 
 
 class StanceDetector:
@@ -103,7 +110,7 @@ class StanceDetector:
         return (shaken / self._settings.accel**2 + turned / self._settings.gyro**2) / count
 
 
-class ZeroVelocity:
+class ZeroVelocity(DeadReckoning):
     """The strapdown and its error filter; has the shape of a dead reckoning method and needs no orientation."""
 
     def __init__(self, settings: ZeroVelocitySettings) -> None:
@@ -136,9 +143,6 @@ class ZeroVelocity:
         """m/s^2, body."""
         return self._accel_bias
 
-    def speed(self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None) -> None:
-        """Ground speed is not used."""
-
     def imu(
         self,
         stamp_ns: int,
@@ -152,8 +156,7 @@ class ZeroVelocity:
         An orientation or linear acceleration by the chip is not used: they are not the strapdown's.
         Raises ValueError without `accel`, or when time does not go on.
         """
-        if accel is None:
-            raise ValueError("zero_velocity: the imu sample has no accel; it needs the raw specific force")
+        accel = required_force(accel, "zero_velocity")
         before = level(accel) if self._orientation is None else self._orientation
         interval = self._clock.interval(stamp_ns)
         gyro_used, force_used = self._less_bias(gyro, accel)

@@ -43,6 +43,13 @@ def required_orientation(orientation: Quaternion | None, method: str) -> Quatern
     return orientation
 
 
+def required_force(accel: Vector | None, method: str) -> Vector:
+    """The specific force (m/s^2, body), or a ValueError that says that it is missing."""
+    if accel is None:
+        raise ValueError(f"{method}: the imu sample has no accel; it needs the raw specific force")
+    return accel
+
+
 def required_acceleration(accel: Vector | None, linear_accel: Vector | None, method: str) -> Vector:
     """The one without gravity (m/s^2, body) where there is one, else the other; ValueError when there is neither."""
     if linear_accel is not None:
