@@ -16,7 +16,7 @@ World: x east, y magnetic north, z up.
 
 import math
 from dataclasses import dataclass, field
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 from caneflow.algorithms.inertial.attitude_recovery import FIELD_ERROR, SMALLEST, Holes, Recovery
 from caneflow.algorithms.inertial.gyro_bias import (
@@ -33,10 +33,12 @@ from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleCloc
 from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, level, required_start
 from caneflow.algorithms.inertial.magnetic_heading import MagneticHeading, MagneticHeadingSettings
 from caneflow.algorithms.inertial.magnetometer_lag import MagnetometerLag
+from caneflow.algorithms.inertial.unseen_turn import UnseenTurn
 from caneflow.algorithms.quantities import Time
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,
+    conjugate,
     from_rotation_vector,
     from_yaw,
     multiply,
@@ -72,6 +74,9 @@ class AttitudeFilter:
         self._bias = GyroBias(settings.bias)
         self._holes = Holes()
         self._recovery: Recovery | None = None  # since the last hole
+        self._opened = 0.0  # s, by which the variance of yaw was opened for it
+        self._unseen = UnseenTurn()
+        self._bridged: _Bridged | None = None  # until the turn in the last hole is known better
 
     @property
     def gaps(self) -> int:
@@ -126,17 +131,43 @@ class AttitudeFilter:
         interval = self._clock.interval(stamp_ns)
         assert interval is not None  # the clock has had its first stamp
         spread = self._holes.spread(interval, gyro, accel)
-        if interval > LONGEST_INTERVAL:
-            self._begin_recovery(spread or math.inf)
-            return self._attitude, 0.0
-        if spread == 0.0:
-            return self._turned(self._attitude, gyro, interval), interval
-        (ax, ay, az), (bx, by, bz) = self._gyro, gyro
-        attitude = self._turned(self._attitude, (0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz)), interval)
+        if spread == 0.0 and interval <= LONGEST_INTERVAL:
+            self._unseen.take(interval, gyro)
+            return self._turned(self._with_turn_found(self._attitude), gyro, interval), interval
+        return self._over_hole(self._attitude, interval, gyro, spread)
+
+    def _over_hole(self, before: Quaternion, interval: float, gyro: Vector, spread: float) -> tuple[Quaternion, float]:
+        """By the turn rates at both ends, until it is known how they went on changing."""
+        self._unseen.begin(interval, gyro)
+        attitude = before
+        if interval <= LONGEST_INTERVAL:
+            (ax, ay, az), (bx, by, bz) = self._gyro, gyro
+            attitude = self._turned(before, (0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz)), interval)
+        elif spread == 0.0:  # a sensor that is always that slow
+            spread = math.inf
+        self._bridged = _Bridged(before, attitude, interval)
         if spread > SMALLEST or self._recovery is not None:
             self._begin_recovery(spread)
             interval = 0.0
         return attitude, interval
+
+    def _with_turn_found(self, attitude: Quaternion) -> Quaternion:
+        """The attitude, with the turn in the last hole as it is known now, if it has just become known."""
+        found = self._unseen.found()
+        if found is None or self._bridged is None:
+            return attitude
+        turn, spread = found
+        before, bridged, lasted = self._bridged
+        bx, by, bz = self._bias.bias
+        drift = from_rotation_vector((-lasted * bx, -lasted * by, -lasted * bz))
+        missing = multiply(multiply(multiply(before, turn), drift), conjugate(bridged))
+        self._bridged = None
+        if self._recovery is not None:
+            self._recovery = None
+            self._heading.close(self._opened)
+            if spread > SMALLEST:
+                self._begin_recovery(spread)
+        return normalized(multiply(missing, attitude))
 
     def _turned(self, attitude: Quaternion, rate: Vector, interval: float) -> Quaternion:
         """At a turn rate (rad/s), less the bias."""
@@ -152,7 +183,7 @@ class AttitudeFilter:
             self._end_recovery()
         self._rest.restart()
         self._recovery = Recovery(spread, self._holes.speed, self._heading.undisturbed())
-        self._heading.open(spread / FIELD_ERROR)
+        self._opened = self._heading.open(spread / FIELD_ERROR)
 
     def _found(
         self,
@@ -226,6 +257,14 @@ class AttitudeFilter:
 
     def _with_yaw(self, attitude: Quaternion) -> Quaternion:
         return normalized(multiply(from_yaw(self._heading.offset), attitude))
+
+
+class _Bridged(NamedTuple):
+    """The attitudes at both ends of a hole, as they were taken, and how long it was."""
+
+    before: Quaternion
+    after: Quaternion
+    lasted: float  # s
 
 
 class _Gravity:

@@ -121,9 +121,16 @@ class MagneticHeading:
         self._variance = math.inf  # s, see above
         self.row: Row = NOTHING_SEEN  # what the corrections tell of the gyro's bias
 
-    def open(self, times: float) -> None:
-        """Yaw may be off by `times` the error of a reading that stands for 1 s."""
-        self._variance += (times * self._settings.time_constant) ** 2
+    def open(self, times: float) -> float:
+        """Yaw may be off by `times` the error of a reading that stands for 1 s; by how much (s) it is opened."""
+        opened = (times * self._settings.time_constant) ** 2
+        self._variance += opened
+        return opened
+
+    def close(self, opened: float) -> None:
+        """Take an opening back, as far as it is still there: yaw is known after all."""
+        if not math.isinf(opened):
+            self._variance = max(self._variance - opened, self._settings.time_constant)
 
     def averaged(self, elapsed: float) -> None:
         """`elapsed` s of readings have been averaged elsewhere."""
