@@ -133,3 +133,31 @@ def test_a_gap_is_counted_and_a_missing_orientation_named() -> None:
     assert shs.gaps == 1
     with pytest.raises(ValueError, match=r"shs: the imu sample has no orientation"):
         shs.imu(START_NS + 2_000_000_000, (0.0, 0.0, 0.0), None, None, None)
+
+
+def pocketed(*, strides: int, stride: float, bobs: int, seed: int = 1) -> StepHeading:
+    """A phone on a thigh: quickly forward, slowly back, once per stride of so many s; `bobs` of 2 m/s^2 in each."""
+    shs = StepHeading(StepHeadingSettings(), boresight=(0.0, 1.0, 0.0), step_length=STEP)
+    random = np.random.default_rng(seed)
+    count = round((2.0 + strides * stride) / PERIOD)
+    impacts = random.normal(0.0, 1.0, count)
+    for k in range(count):
+        t = max(k * PERIOD - 2.0, 0.0)
+        phase = t / stride % 1.0
+        forward, back = math.radians(200.0), math.radians(35.0)  # rad/s; the slow way back is no swing
+        rate = forward * math.sin(2.0 * math.pi * phase) if phase < 0.5 else -back * math.sin(2.0 * math.pi * phase)
+        force = 9.80665 + (2.0 * math.sin(2.0 * math.pi * bobs * t / stride) + impacts[k] if t > 0.0 else 0.0)
+        shs.imu(START_NS + k * 10_000_000, (rate, 0.0, 0.0), (0.0, 0.0, force), rotations.IDENTITY, None)
+    return shs
+
+
+@pytest.mark.parametrize("stride", [1.0, 1.1, 1.3])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_phone_that_swings_once_per_stride_is_told_by_two_bobs_in_each(stride: float, seed: int) -> None:
+    shs = pocketed(strides=60, stride=stride, bobs=2, seed=seed)
+    assert shs.steps == pytest.approx(120, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_one_bob_to_a_swing_is_a_step(seed: int) -> None:
+    assert pocketed(strides=60, stride=0.9, bobs=1, seed=seed).steps == pytest.approx(60, abs=2)

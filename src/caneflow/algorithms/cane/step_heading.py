@@ -1,13 +1,21 @@
 """Step and heading, adapted to the white cane as in section VI of the paper (cane.md row 13).
 
-The cane is swung once per step. Between two swings it stands still for an instant, a stationary point.
+The cane is swung once per step. Between two swings it stands still for an instant, a stationary point. So does a phone
+in a hand; one in a pocket may swing once per stride, which its vertical acceleration tells (step_bob.py).
 """
 
 import math
 from dataclasses import dataclass
 
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
-from caneflow.algorithms.inertial.imu_sample import SampleClock, heading_of, required_orientation
+from caneflow.algorithms.cane.step_bob import StepBob
+from caneflow.algorithms.inertial.imu_sample import (
+    LONGEST_INTERVAL,
+    SampleClock,
+    heading_of,
+    required_orientation,
+    world_acceleration,
+)
 from caneflow.algorithms.quantities import Time, TurnRate
 from caneflow.algorithms.rotations import Quaternion, Vector
 
@@ -45,6 +53,7 @@ class StepHeading(DeadReckoning):
         self._heading_sum = (0.0, 0.0)  # of (cos psi, sin psi), since then
         self._velocity: Vector = (0.0, 0.0, 0.0)
         self._position: Vector = (0.0, 0.0, 0.0)
+        self._bob = StepBob()
         self.steps = 0
 
     @property
@@ -69,6 +78,8 @@ class StepHeading(DeadReckoning):
         norm = math.sqrt(gyro[0] ** 2 + gyro[1] ** 2 + gyro[2] ** 2)
         cos_psi, sin_psi = heading_of(orientation, self._boresight)
         self._since += interval or 0.0
+        if interval is not None and interval <= LONGEST_INTERVAL and (accel is not None or linear_accel is not None):
+            self._bob.update(interval, world_acceleration(orientation, accel, linear_accel, "shs")[2])
         self._peak = max(self._peak, norm)
         self._heading_sum = self._heading_sum[0] + cos_psi, self._heading_sum[1] + sin_psi
         if self._since >= self._settings.shortest_swing and self._stationary(norm):
@@ -85,10 +96,13 @@ class StepHeading(DeadReckoning):
         if self._peak > self._settings.swing_rate:
             x, y = self._heading_sum
             length = math.hypot(x, y) or 1.0
-            step_x, step_y = self._step_length * x / length, self._step_length * y / length
+            steps = 2 if self._bob.is_stride else 1
+            walked = steps * self._step_length
+            step_x, step_y = walked * x / length, walked * y / length
             self._position = self._position[0] + step_x, self._position[1] + step_y, 0.0
             self._velocity = step_x / self._since, step_y / self._since, 0.0
-            self.steps += 1
+            self.steps += steps
+            self._bob.end_swing()
         else:
             self._velocity = (0.0, 0.0, 0.0)
         self._since, self._peak, self._heading_sum = 0.0, 0.0, (0.0, 0.0)
