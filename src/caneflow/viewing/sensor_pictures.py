@@ -15,7 +15,7 @@ from caneflow.algorithms.glitches import GlitchSettings
 from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
 from caneflow.algorithms.inertial.gated_attitude import GatedAttitude
 from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
-from caneflow.algorithms.radar.doppler_line import DopplerLine, DopplerLineSettings, predominant_line
+from caneflow.algorithms.radar.doppler_line import DopplerLine, DopplerLineSettings, LineFollower
 from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrum, DopplerSpectrumSettings, SlidingSpectrum
 from caneflow.algorithms.radar.range_doppler import hann, range_doppler_map, speed_limit
 from caneflow.messages import DopplerBlock, Imu, RadarFrame
@@ -134,14 +134,15 @@ def doppler_picture(blocks: Sequence[DopplerBlock], *, origin: int) -> DopplerPi
     signed = spectra[-1].signed
     if not signed:
         speeds = -speeds
+    shown = np.abs(speeds) <= FASTEST  # a spectrum reaches beyond its band
     every = max(1, len(times) // MOST_COLUMNS)
     found = np.array([(stamp, line.range_rate) for stamp, line in _lines(blocks) if line.valid]).reshape(-1, 2)
     at = {int(stamp): rate for stamp, rate in found}
     line = np.array([at.get(int(stamp), np.nan) for stamp in stamps])
     return DopplerPicture(
         times=times[::every],
-        speeds=speeds,
-        power=(power - np.median(power))[:, ::every],
+        speeds=speeds[shown],
+        power=(power - np.median(power))[shown, ::every],
         signed=signed,
         line=line[::every],
         source="line of operators.doppler",
@@ -198,9 +199,9 @@ def _orientations(samples: Sequence[Imu]) -> tuple[Floats | None, str]:
 
 
 def _lines(blocks: Sequence[DopplerBlock]) -> Iterable[tuple[int, DopplerLine]]:
-    settings = DopplerLineSettings()
+    follower = LineFollower(DopplerLineSettings())
     for stamp, spectrum in _spectra(blocks, DopplerSpectrumSettings()):
-        yield stamp, predominant_line(spectrum, settings)
+        yield stamp, follower.update(spectrum)
 
 
 def _spectra(blocks: Iterable[DopplerBlock], settings: DopplerSpectrumSettings) -> list[tuple[int, DopplerSpectrum]]:
