@@ -4,7 +4,7 @@
 #include <stdbool.h>
 
 enum {
-    HIT = 27, MISS = 9, FLOOR_SEEN = 16, BELOW_FLOOR = 16, NO_FLOOR = 8, /* counts of 1/32 nat */
+    HIT = 27, MISS = 9, FLOOR_SEEN = 16, BELOW_FLOOR = 16, NO_FLOOR = 10, /* counts of 1/32 nat */
     LEAST = -48, MOST = 96,
     STEP = 256, STEPS = 64, /* along a ray, in 1/4096 m */
     FREE_MARGIN = 328, FREE_WITHOUT_TARGET = 4915, BEYOND_FLOOR = 1434, /* in 1/4096 m */

@@ -82,7 +82,7 @@ class SlowGrid:
         for key in hits | misses:
             self.add(self.occupied, key, 27 if key in hits else -9, key[1:])
         for cell in floors | below | absent:
-            self.add(self.missing, cell, -16 if cell in floors else 16 if cell in below else 8, cell)
+            self.add(self.missing, cell, -16 if cell in floors else 16 if cell in below else 10, cell)
 
     def add(self, cells: dict[Any, int], key: tuple[int, ...], change: int, place: tuple[int, ...]) -> None:
         if self.is_inside(place):

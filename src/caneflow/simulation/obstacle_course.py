@@ -27,7 +27,7 @@ CEILING, CELLAR = 2.6, -1.5  # m
 DOOR = 0.9  # m
 HAND = 0.30  # m ahead of the body
 STOP_BEFORE = HAND + 0.45  # m from the body to a thing, where an approach ends
-CLEARANCE = 0.45  # m from the middle of the body to what is passed, chosen: shoulder and a hand's breadth
+CLEARANCE = 0.5  # m from the middle of the body to what is passed, chosen: shoulder and a hand's breadth
 PERSON_SPEED = 0.9  # m/s, chosen: slowed down by a corridor
 BLACK = 0.04  # reflectance of black cloth
 
@@ -103,9 +103,9 @@ def corridor(rng: Generator) -> ObstacleCourse:
         aside = _past(thing)
         if kind == "person":
             thing = replace(thing, velocity=(-PERSON_SPEED, 0.0), halt=1000.0)
-        way += [(x - 0.5, aside), (x + 0.7, aside)]
+        way += [(x - 0.5, aside), (x + 0.5, aside)]
         things.append(thing)
-        x += float(rng.uniform(3.2, 4.2))
+        x += float(rng.uniform(3.5, 4.3))
     end = x + 1.5
     stair = stairs_down(rng, 0.0).moved(end + STOP_BEFORE)
     way += [(x - 0.5, 0.0), (end, 0.0)]
@@ -150,7 +150,7 @@ def room(rng: Generator) -> ObstacleCourse:
         aside = _past(thing)
         way += [(x - 0.5, aside), (x + 0.7, aside)]
         things.append(thing)
-        x += 3.2
+        x += 3.6
     way.append((x, 0.0))
     return ObstacleCourse(
         kind="room",

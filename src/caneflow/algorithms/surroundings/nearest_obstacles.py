@@ -127,22 +127,17 @@ class NearestObstacles:
         ahead = np.add.outer(view.cos * x, view.sin * y).reshape(-1)
         aside = np.add.outer(-view.sin * x, view.cos * y).reshape(-1)
         weights, known = self._weights(grid), _known(grid, self._slices)
-        for sector, cells in enumerate(self._sectors(ahead, aside)):
+        needed = np.array([2 * settings.support] * 3 + [settings.support_drop])
+        for sector, unordered in enumerate(self._sectors(ahead, aside)):
+            cells = unordered[np.argsort(ahead[unordered], kind="stable")]
             self.known[sector] = np.count_nonzero(known[:, cells], axis=1) / max(len(cells), 1)
-            here = weights[:, cells]
-            for level in range(4):
+            chosen = _nearest(ahead[cells], weights[:, cells], needed, settings.depth)
+            for level, first in enumerate(chosen):
                 found = None
-                supported = np.flatnonzero(here[level])
-                if len(supported):
-                    needed = settings.support_drop if level == DROP else 2 * settings.support
-                    occupied = cells[supported]
-                    first = _nearest(ahead[occupied], here[level, supported], needed, settings.depth)
-                    if first is not None:
-                        at = int(occupied[first])
-                        row, column = divmod(at, len(x))
-                        found = Found(
-                            float(ahead[at]), float(aside[at]), float(x[row]) + view.x, float(y[column]) + view.y
-                        )
+                if first >= 0:
+                    at = int(cells[first])
+                    row, column = divmod(at, len(x))
+                    found = Found(float(ahead[at]), float(aside[at]), float(x[row]) + view.x, float(y[column]) + view.y)
                 self.entries[sector][level].update(stamp_ns, middle_ns, found, settings)
 
     def _sectors(self, ahead: Table, aside: Table) -> Iterator[NDArray[np.intp]]:
@@ -162,7 +157,9 @@ class NearestObstacles:
         likely = (grid.occupancy >= settings.likely).view(np.uint8)
         weights = (occupied + likely).reshape(grid.slices, -1)
         missing = (grid.floor_missing >= settings.missing).view(np.uint8).reshape(-1)
-        return np.stack([*(np.add.reduce(weights[first:last]) for first, last in self._slices), missing])
+        return np.stack(
+            [*(np.add.reduce(weights[first:last], dtype=np.uint8) for first, last in self._slices), missing]
+        )
 
 
 def _known(grid: OccupancyGrid, slices: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
@@ -172,16 +169,16 @@ def _known(grid: OccupancyGrid, slices: Sequence[tuple[int, int]]) -> NDArray[np
     return np.stack([*levels, grid.floor_missing.reshape(-1) != 0])
 
 
-def _nearest(ahead: Table, weights: NDArray[np.uint8], needed: int, depth: float) -> int | None:
-    """Index of the nearest cell from which on a weight of `needed` lies within `depth`, m; None when there is none."""
-    order = np.argsort(ahead, kind="stable")
-    gathered = 0
-    last = 0
-    for first in order:
-        while last < len(order) and ahead[order[last]] <= ahead[first] + depth:
-            gathered += int(weights[order[last]])
-            last += 1
-        if gathered >= needed:
-            return int(first)
-        gathered -= int(weights[first])
-    return None
+def _nearest(ahead: Table, weights: NDArray[np.uint8], needed: NDArray[np.int64], depth: float) -> list[int]:
+    """By level the nearest cell from which on a weight of `needed` lies within `depth`, m; -1 when there is none.
+
+    `ahead` (n,) m, in order; `weights` (levels, n).
+    """
+    if not weights.any():
+        return [-1] * len(weights)
+    upto = np.zeros((len(weights), len(ahead) + 1), np.int64)
+    np.cumsum(weights, axis=1, out=upto[:, 1:])
+    gathered = upto[:, np.searchsorted(ahead, ahead + depth, side="right")] - upto[:, :-1]
+    enough = (gathered >= needed[:, None]) & (weights > 0)
+    first = np.where(enough.any(axis=1), enough.argmax(axis=1), -1)
+    return [int(each) for each in first]

@@ -47,7 +47,7 @@ class GridSettings:
     miss: Counts = 9  # a ray that went through it
     floor_seen: Counts = 16  # taken off the missing floor
     below_floor: Counts = 16  # a ray that goes on below where the floor should be
-    no_floor: Counts = 8  # no answer, or one from beyond, where the floor has been answering
+    no_floor: Counts = 10  # no answer, or one from beyond, where the floor has been answering
 
 
 class Rays(NamedTuple):
