@@ -122,13 +122,15 @@ class Surroundings(Operator):
         self._pose: Pose | None = None  # the newest
         self._pose_watch = StreamWatch(POSE)
         self._imu_watch = StreamWatch(IMU) if IMU in context.ports else None
+        self._watches = [*(sensor.watch for sensor in self._sensors.values()), self._pose_watch]
+        if self._imu_watch is not None:
+            self._watches.append(self._imu_watch)
         self._leader: str | None = None  # the sensor that looks highest, once a pose is known
         self._worn = 0.0  # s since the map was last made to forget, longer where the pose is worse
         self._start_ns: int | None = None  # stamp of the first sample
         self._cue_ns: int | None = None  # of the last cue
         self._was_blind = False
         self._grid_ns: int | None = None  # of the last grid
-        self._free_ns = 0  # since when there is nothing to tell of
         self._last_ns: dict[str, int] = {}  # by port the stamp of the last sample
 
     @classmethod
@@ -165,10 +167,8 @@ class Surroundings(Operator):
                 return
         elif isinstance(message, Imu) and self._imu_watch is not None:
             self._imu_watch.take(message.stamp, (message.gyro, message.accel, message.orientation))
-        reason, since = self._blind(message.stamp)
-        late = self._cue_ns is None or message.stamp - self._cue_ns >= CUE_NS
-        if late or (reason and not self._was_blind):
-            yield from self._cue(message.stamp, reason, since)
+        if self._cue_ns is None or message.stamp - self._cue_ns >= CUE_NS or self._has_gone_blind(message.stamp):
+            yield from self._cue(message.stamp, *self._blind(message.stamp))
 
     def _require_usable(self, port: str, message: Sample) -> None:
         """Raise Refused before anything has changed."""
@@ -323,13 +323,16 @@ class Surroundings(Operator):
             ),
         )
 
+    def _has_gone_blind(self, now_ns: int) -> bool:
+        """Whether something is missing that the last cue did not say."""
+        if self._was_blind:
+            return False
+        return any(watch.is_silent(now_ns) or watch.is_frozen for watch in self._watches)
+
     def _blind(self, now_ns: int) -> tuple[str, int]:
         """Why nothing can be seen, empty when all is well, and the stamp of the last good sample of what is missing."""
-        watches = [*(sensor.watch for sensor in self._sensors.values()), self._pose_watch]
-        if self._imu_watch is not None:
-            watches.append(self._imu_watch)
-        silent = [watch for watch in watches if watch.is_silent(now_ns)]
-        frozen = [watch for watch in watches if watch.is_frozen and watch not in silent]
+        silent = [watch for watch in self._watches if watch.is_silent(now_ns)]
+        frozen = [watch for watch in self._watches if watch.is_frozen and watch not in silent]
         if not silent and not frozen:
             return "", now_ns
         said = [f"{', '.join(w.name for w in silent)}: no sample"] if silent else []

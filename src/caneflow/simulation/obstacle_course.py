@@ -133,10 +133,10 @@ def room(rng: Generator) -> ObstacleCourse:
     """A wide room with furniture, a glass pane, something black, and people who stand."""
     half = float(rng.uniform(3.0, 5.0))
     walls = [
-        Solid((-3.0, 18.0, side * half - 0.1, side * half + 0.1, CELLAR, CEILING), float(rng.uniform(0.4, 0.8)))
+        Solid((-3.0, 22.0, side * half - 0.1, side * half + 0.1, CELLAR, CEILING), float(rng.uniform(0.4, 0.8)))
         for side in (-1, 1)
     ]
-    walls.append(Solid((17.5, 18.0, -half, half, CELLAR, CEILING), 0.6))
+    walls.append(Solid((21.5, 22.0, -half, half, CELLAR, CEILING), 0.6))
     things, way, x = [], [(0.0, 0.0), (2.5, 0.0)], 4.5
     for kind in _shuffled(["table", "person", "glass", "black"], rng):
         offset = float(rng.uniform(-0.2, 0.2))

@@ -8,7 +8,7 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from caneflow.algorithms.quantities import Length
+from caneflow.algorithms.quantities import Length, Zero
 from caneflow.algorithms.surroundings.occupancy_grid import CELL, LEAST, MOST, SLICE, OccupancyGrid
 
 LEFT, AHEAD, RIGHT = 0, 1, 2
@@ -30,6 +30,7 @@ class NearestSettings:
     support: Count = 2  # cells within `depth`
     support_drop: Count = 5
     depth: Length = 0.35  # m
+    edge: Length | Zero = 0.05  # m at either side of the way ahead in which nothing counts: the map is no better
     confirm: Count = 2  # updates in a row with support
     hold: Count = 4  # updates without, after which it is not told of any more
     nearest: Length = 0.15  # m ahead of the hand, where the sectors begin
@@ -131,7 +132,10 @@ class NearestObstacles:
         for sector, unordered in enumerate(self._sectors(ahead, aside)):
             cells = unordered[np.argsort(ahead[unordered], kind="stable")]
             self.known[sector] = np.count_nonzero(known[:, cells], axis=1) / max(len(cells), 1)
-            chosen = _nearest(ahead[cells], weights[:, cells], needed, settings.depth)
+            here = weights[:, cells]
+            if sector == AHEAD:
+                here[:, np.abs(aside[cells]) > self._half - settings.edge] = 0
+            chosen = _nearest(ahead[cells], here, needed, settings.depth)
             for level, first in enumerate(chosen):
                 found = None
                 if first >= 0:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, multiply, normalized, rotate
 
 LONGEST_STEP_NS = 100_000_000  # ns between two poses over which one in between may be computed
-KEPT_NS = 1_500_000_000  # ns of poses that are kept: longer than any exposure is late, and than one step lasts
+KEPT_NS = 300_000_000  # ns of poses that are kept: longer than any exposure's middle is late
 DIRECTION_ONE = 1 << 14  # a direction's component of 1, as an integer
 
 Floats = NDArray[np.float64]
@@ -68,7 +68,7 @@ class PoseTrack:
         """Append a pose that is newer than the last."""
         self._stamps.append(stamp_ns)
         self._poses.append(pose)
-        if len(self._stamps) > 64 and self._stamps[0] < stamp_ns - 2 * KEPT_NS:
+        if self._stamps[0] < stamp_ns - 2 * KEPT_NS:
             old = bisect_left(self._stamps, stamp_ns - KEPT_NS)
             del self._stamps[:old], self._poses[:old]  # in one go now and then
 
