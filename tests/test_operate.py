@@ -194,11 +194,12 @@ def test_what_is_wrong_at_the_start_is_told_before_it_goes_to_the_background(wri
     assert (ended.returncode, ended.stdout) == (2, "")
 
 
-def test_a_terminal_shows_how_far_a_replay_is(written: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("more", [["--speed", "3"], ["--in-process"]], ids=" ".join)
+def test_a_terminal_shows_how_far_a_replay_is(written: Path, tmp_path: Path, more: list[str]) -> None:
     written.write_text(REPLAYED)
     walk = write_walk(tmp_path / "walk.mcap", samples=300)
     terminal, inner = pty.openpty()
-    command = [*CANEFLOW, "run", str(written), "--replay", str(walk), "--speed", "3"]
+    command = [*CANEFLOW, "run", str(written), "--replay", str(walk), *more]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=inner, env={**os.environ, "TERM": "xterm"}) as run:
         os.close(inner)
         said = b""

@@ -28,6 +28,7 @@ from caneflow.runtime.hosts.launcher.console import Console
 from caneflow.runtime.hosts.launcher.fork_server import ForkServer
 from caneflow.runtime.hosts.launcher.launcher import Launcher
 from caneflow.runtime.hosts.launcher.open_files import raise_limit, require_open_files
+from caneflow.runtime.hosts.launcher.replay_progress import ReplayProgress
 from caneflow.runtime.outcome import Outcome, troubles
 from caneflow.runtime.replayed import Replay
 from caneflow.runtime.wording import listed
@@ -146,7 +147,10 @@ def command(
         started = time.monotonic()
         if fork_server is None:
             programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
-            outcome = InProcess(deployment, programs).run_until_interrupted()
+            host = InProcess(deployment, programs)
+            with Console(deployment.flow) as console:
+                progress = ReplayProgress(deployment.origin, deployment.last, console.played)
+                outcome = host.run_until_interrupted(lambda stamp: progress.look((stamp,)))
         else:
             restarts = {name: node.restart for name, node in graph.nodes.items()}
             keys = keys or file.parent / "keys"

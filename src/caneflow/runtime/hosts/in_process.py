@@ -6,7 +6,7 @@ give the same bytes.
 
 import heapq
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
 from itertools import islice
 from typing import TypeAlias
@@ -50,11 +50,14 @@ class InProcess:
             raise KeyboardInterrupt
         return outcome
 
-    def run_until_interrupted(self) -> Outcome:
-        """The same; after a signal the outcome says so, and holds what was counted up to there."""
+    def run_until_interrupted(self, handled: Callable[[int], None] = lambda _: None) -> Outcome:
+        """The same; after a signal the outcome says so, and holds what was counted up to there.
+
+        `handled` is told now and then up to which stamp (ns) everything has been handled.
+        """
         outcome = Outcome()
         try:
-            copy_context().run(self._run)  # numpy's errors are set for the operators, and for nobody else here
+            copy_context().run(self._run, handled)  # numpy's errors are set for the operators, and for nobody else here
         except KeyboardInterrupt:
             outcome.interrupted = True
         finally:
@@ -64,7 +67,7 @@ class InProcess:
             note_losses(outcome)
         return outcome
 
-    def _run(self) -> None:
+    def _run(self, handled: Callable[[int], None]) -> None:
         arriving = self._merged()
         while batch := list(islice(arriving, BATCH)):
             for name, port, sample in batch:
@@ -73,6 +76,7 @@ class InProcess:
             for feed in self._group.feeds.values():
                 feed.nothing_until(last - 1)
             self._handle_what_is_due()
+            handled(last)
         for feed in self._group.feeds.values():
             feed.ended = True
         self._handle_what_is_due()
