@@ -20,7 +20,7 @@ from caneflow import __version__, command
 from caneflow.messages import control_key, encode
 from caneflow.messages.control import Delays, EdgeStatus, FlowStatus, NodeStatus
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attached import attach
+from caneflow.runtime.hosts.attached import attach, diagnosis
 from caneflow.runtime.hosts.attached.diagnosis import diagnosed
 from caneflow.runtime.hosts.attached.way_to import Finding, way_to
 from caneflow.runtime.hosts.launcher.run_directory import RunningFlow
@@ -385,8 +385,19 @@ def test_the_command_says_where_what_and_what_to_try(
     assert "\n                 try  on 127.0.0.1: caneflow status; does the flow run?\n" in out
 
 
+def test_of_several_flows_each_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    running = [RunningFlow("cane", 1, "tcp/127.0.0.1:1"), RunningFlow("room", 2, "tcp/127.0.0.1:2")]
+    for module in (attach, diagnosis):
+        monkeypatch.setattr(module, "running_flows", lambda: running)
+    assert [finding.node for finding in diagnosed()] == ["cane: tcp/127.0.0.1:1", "room: tcp/127.0.0.1:2"]
+    assert [finding.node for finding in diagnosed("room")] == ["tcp/127.0.0.1:2"]
+    (finding,) = diagnosed("roam")
+    assert (finding.text, finding.attempts) == ("no flow 'roam' runs on this machine; did you mean 'room'?", ())
+
+
 def test_a_flow_that_does_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attach, "running_flows", list)
+    for module in (attach, diagnosis):
+        monkeypatch.setattr(module, "running_flows", list)
     (finding,) = diagnosed()
     assert finding.state == "bad"
     assert finding.text.startswith("no flow runs on this machine; ")

@@ -99,6 +99,18 @@ def test_ctrl_c_while_the_command_is_imported_says_nothing(tmp_path: Path) -> No
     assert program.returncode == 130
 
 
+@pytest.mark.parametrize(
+    ("name", "held"), [("caneflow", {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}), ("mine", set())]
+)
+def test_the_command_holds_signals_from_its_first_import_on(tmp_path: Path, name: str, held: set[int]) -> None:
+    """And no other program does that imports the library."""
+    (tmp_path / name).write_text(
+        "import caneflow, signal\nprint(*map(int, signal.pthread_sigmask(signal.SIG_BLOCK, ())))"
+    )
+    done = subprocess.run([sys.executable, tmp_path / name], capture_output=True, text=True, check=True)
+    assert {int(number) for number in done.stdout.split()} == held
+
+
 ENDS = [([signal.SIGINT], 130), ([signal.SIGINT] * 3, 130), ([signal.SIGTERM], -15), ([signal.SIGHUP], -1)]
 
 

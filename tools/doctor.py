@@ -54,8 +54,9 @@ def command(
 ) -> None:
     """Say what is wrong with a running flow: links, nodes, wires, clocks (ms); or with the devices; and what to try.
 
-    Of a flow: who listens, who dials, who is denied, versions and clocks of its machines, where samples are lost. Of
-    each device (--devices): whether it is there, answers, how often it measures (Hz) and how it is calibrated.
+    Of a flow (without its name, of each that runs here): who listens, who dials, who is denied, versions and clocks of
+    its machines, where samples are lost. Of each device (--devices): whether it is there, answers, how often it
+    measures (Hz) and how it is calibrated.
     Exit status 0: nothing is bad. 1: something is.
 
     Example: caneflow doctor cane

@@ -1,5 +1,12 @@
 """caneflow: a handful of sensors become a position, as a graph of processes over Zenoh."""
 
+import sys
+
+if sys.argv[0].endswith("/caneflow"):  # the command: Ctrl-C waits from here on until it can be taken (interrupts)
+    import signal
+
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
+
 from caneflow import dispatch
 
 __version__: str

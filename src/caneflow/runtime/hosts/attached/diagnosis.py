@@ -7,6 +7,7 @@ on its own: the name, the port, the certificates, the link, the answer.
 import platform
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -26,6 +27,7 @@ from caneflow.runtime.hosts.attached.attach import (
 )
 from caneflow.runtime.hosts.attached.way_to import Finding, way_to
 from caneflow.runtime.hosts.launcher.node_statistics import OLD, OTHER_CLOCK
+from caneflow.runtime.hosts.launcher.run_directory import running_flows
 from caneflow.runtime.hosts.links.session import UNIX, open_session
 from caneflow.runtime.wording import listed, one_line
 
@@ -46,11 +48,18 @@ PLACES: dict[str, tuple[str, tuple[str, ...]]] = {  # where a sample is lost: wh
 
 
 def diagnosed(flow: str | None = None, at: str | None = None, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
-    """What there is to say of the running flow `flow`, on this machine or at the endpoint `at`."""
+    """What there is to say of the running flow `flow`, on this machine or at the endpoint `at`; of None of all here."""
+    names = dict.fromkeys(found.flow for found in running_flows()) if flow is None and at is None else ()
+    if len(names) > 1:
+        for name in names:
+            for finding in diagnosed(name, at, keys):
+                yield replace(finding, node=f"{name}: {finding.node}")
+        return
     try:
         endpoint = at or endpoint_of(flow)
     except DataflowError as error:
-        yield Finding(node=flow or "flow", state="bad", text=str(error), attempts=TO_FIND_A_FLOW)
+        try_this = () if running_flows() else TO_FIND_A_FLOW
+        yield Finding(node=flow or "flow", state="bad", text=str(error), attempts=try_this)
         return
     for finding in way_to(endpoint, keys):
         yield finding
