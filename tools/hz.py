@@ -105,7 +105,8 @@ def measured(here: Attached, streams: list[tuple[str, str]], seconds: float) -> 
 def lines(figures: dict[str, dict[str, Any]]) -> Iterator[str]:
     """The same for people."""
     rows: list[tuple[str, ...]] = [
-        ("stream", "samples", "Hz", "Hz by stamps", "steps ms", "jitter ms", "missing", "unreadable")
+        ("stream", "count", "rate", "stamped", "steps", "jitter", "missing", "bad"),
+        ("", "", "Hz", "Hz", "ms", "ms", "", ""),
     ]
     for stream, of in figures.items():
         steps = "-" if of["longest"] is None else f"{_ms(of['shortest'])} .. {_ms(of['longest'])}"

@@ -7,12 +7,14 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from caneflow.messages.control import Delays, EdgeStatus, FlowStatus, NodeStatus
+from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
 from caneflow.options import At, Keys
 from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
 from caneflow.runtime.wording import in_columns, span
 
 PLACES = ("sender", "wire", "decode", "queue", "late")  # where a sample may be lost, on its way
+DELAYS = ("edge", "Hz", "latency ms", "age ms", "silent s")  # median / 99th percentile
+COUNTS = ("edge", "handled", "waiting", "lost")
 STALE = 3.0  # s without word from a node that says its counters once a second
 
 
@@ -70,10 +72,9 @@ def lines(status: FlowStatus) -> Iterator[str]:
         rows = [(*row, machine) for row, machine in zip(rows, machines, strict=True)]
     yield from in_columns(rows, right=(2, 3, 4, 5, 6))
     yield ""
-    head = ("edge", "rate", "latency", "age", "silent", "handled", "waiting", *PLACES)
-    edges = [_edge(edge) for edge in status.edges]
-    yield "Hz; latency and age median / 99 % in ms; silent in s; then samples, on the right those lost by place"
-    yield from in_columns([head, *edges], right=range(1, len(head)))
+    yield from in_columns([DELAYS, *map(_delays, status.edges)], right=range(1, len(DELAYS)))
+    yield ""
+    yield from in_columns([COUNTS, *map(_counts, status.edges)], right=(1, 2))
     for node in status.nodes:
         if node.state != "ready" and node.said:
             yield f"{node.node} said: {node.said}"
@@ -82,7 +83,7 @@ def lines(status: FlowStatus) -> Iterator[str]:
 def _node(node: NodeStatus) -> tuple[str, ...]:
     cpu = "-" if node.cpu is None else f"{100 * node.cpu:.1f} %"
     memory = "-" if node.memory is None else f"{node.memory / 1e6:.0f} MB"
-    sent = ", ".join(f"{port} {number}{_at_rate(node.rates[port])}" for port, number in node.sent.items())
+    sent = ", ".join(f"{port} {_at_rate(node.rates[port])}" for port in node.sent)
     if node.process:  # the first node of a process shows what that costs
         cpu, memory = (f"in {node.process}", "") if node.cpu is None else (f"{node.process}: {cpu}", memory)
     state = node.state
@@ -91,23 +92,29 @@ def _node(node: NodeStatus) -> tuple[str, ...]:
     return node.node, state, str(node.pid or "-"), span(node.uptime), cpu, memory, str(node.restarts), sent or "-"
 
 
-def _edge(edge: EdgeStatus) -> tuple[str, ...]:
+def _delays(edge: EdgeStatus) -> tuple[str, ...]:
     delays = edge.delays
     return (
-        f"{edge.writer} > {edge.reader}",
+        _wire(edge),
         "-" if edge.rate is None else f"{edge.rate:.1f}",
-        *_delays(delays),
+        _both(delays.latency_p50, delays.latency_p99),
+        _both(delays.age_p50, delays.age_p99),
         "-" if delays.silent is None else f"{delays.silent:.2f}",
-        str(edge.handled),
-        str(edge.waiting),
-        *(str(getattr(edge, place)) for place in PLACES),
     )
 
 
-def _delays(delays: Delays) -> Iterator[str]:
-    for p50, p99 in ((delays.latency_p50, delays.latency_p99), (delays.age_p50, delays.age_p99)):
-        yield "-" if p50 is None or p99 is None else f"{1e3 * p50:.2f} / {1e3 * p99:.2f}"
+def _counts(edge: EdgeStatus) -> tuple[str, ...]:
+    lost = ", ".join(f"{number} {place}" for place in PLACES if (number := getattr(edge, place)))
+    return _wire(edge), str(edge.handled), str(edge.waiting), lost or "0"
+
+
+def _wire(edge: EdgeStatus) -> str:
+    return f"{edge.writer} > {edge.reader}"
+
+
+def _both(p50: float | None, p99: float | None) -> str:
+    return "-" if p50 is None or p99 is None else f"{1e3 * p50:.3g} / {1e3 * p99:.3g}"
 
 
 def _at_rate(rate: float | None) -> str:
-    return "" if rate is None else f" at {rate:.1f} Hz"
+    return "-" if rate is None else f"{rate:.1f} Hz"
