@@ -81,7 +81,7 @@ def lines(status: FlowStatus) -> Iterator[str]:
 
 
 def _node(node: NodeStatus) -> tuple[str, ...]:
-    cpu = "-" if node.cpu is None else f"{100 * node.cpu:.1f} %"
+    cpu = "-" if node.cpu is None else f"{100 * node.cpu:.0f} %"
     memory = "-" if node.memory is None else f"{node.memory / 1e6:.0f} MB"
     sent = ", ".join(f"{port} {_at_rate(node.rates[port])}" for port in node.sent)
     if node.process:  # the first node of a process shows what that costs
