@@ -52,13 +52,16 @@ def reading(seq: int, begin: int, **changes: Any) -> bytes:
     return packed
 
 
-def began(launch: Callable[..., Launched], tmp_path: Path, *options: object) -> tuple[Launched, str, str]:
-    """A flow that waits for its external node; its name, and where that dials."""
+def began(
+    launch: Callable[..., Launched], tmp_path: Path, *options: object, by_file: bool = False
+) -> tuple[Launched, str, str]:
+    """A flow that waits for its external node; its name, and where that dials, which the file or the command says."""
     flow = "x" + tmp_path.name.replace("_", "")[-30:].lower()
-    file = tmp_path / "flow.yaml"
-    file.write_text(FLOW.format(flow=flow))
-    at = f"tcp/127.0.0.1:{free_port()}"
-    running = launch("run", file, "--listen", at, *options, log=tmp_path / "log")
+    file, at = tmp_path / "flow.yaml", f"tcp/127.0.0.1:{free_port()}"
+    machines = f"machines: {{here: {{listen: [{at}]}}}}\n" if by_file else ""
+    file.write_text(machines + FLOW.format(flow=flow))
+    listen = () if by_file else ("--listen", at)
+    running = launch("run", file, *listen, *options, log=tmp_path / "log")
     running.wait_for("other programs attach at")
     return running, flow, at
 
@@ -81,7 +84,7 @@ def test_its_samples_reach_the_reader_and_the_recording_byte_for_byte(
     launch: Callable[..., Launched], tmp_path: Path, encoding: zenoh.Encoding
 ) -> None:
     out = tmp_path / "out.mcap"
-    running, flow, at = began(launch, tmp_path, "--record", out)
+    running, flow, at = began(launch, tmp_path, "--record", out, by_file=encoding is ENCODINGS[0])
     with client(at) as session:
         wait_for(lambda: {n.state for n in status(session, flow).nodes} == {"external", "ready"}, "the others")
         [external] = [node for node in status(session, flow).nodes if node.state == "external"]

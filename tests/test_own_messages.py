@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,16 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from caneflow.messages import Imu, Sample, decode, numbered, registry
+from caneflow.messages import Imu, MessageError, Sample, decode, numbered, registry
 from caneflow.messages.arrays import to_bytes
 from caneflow.messages.rig import read_rig
 from caneflow.recording import Recorded, RecordingWriter
 from caneflow.recording.untyped_rows import untyped_rows
 from caneflow.runtime.dataflow.loading import examine
 from caneflow.runtime.hosts.attached.attach import Heard
+from caneflow.runtime.hosts.process.events import Arrived
+from caneflow.runtime.hosts.process.inputs import check_schema
+from caneflow.runtime.plan import InputPlan
 from caneflow.runtime.stages.snapshot import pack, unpack
 from caneflow.runtime.user_files import kind_at, module_of, place_of
 from caneflow.viewing.live import LiveStreams
@@ -122,7 +126,7 @@ def run(project: Path, name: str, *options: object) -> dict[str, tuple[str, dict
 def test_every_host_carries_it_and_records_it_under_its_schema(project: Path) -> None:
     inside = run(project, "inside.mcap", "--in-process")
     spread = run(project, "spread.mcap", "--speed", "max")
-    assert inside == spread
+    assert inside == spread == run(project, "grouped.mcap", "--speed", "max", "--one-process")
     name, schema, payloads = spread["own/doubler/range"]
     assert name == schema["title"] == "mine.Range/1"
     assert schema["required"] == ["stamp", "seq", "distance"]
@@ -221,6 +225,7 @@ def test_one_process_has_one_class_of_a_name_whichever_file_comes_first(project:
     doubler.write_text(doubler.read_text().replace("from ranges", "from ranger"))
     expected = run(project, "one.mcap", "--in-process")
     assert run(project, "processes.mcap", "--speed", "max") == expected
+    assert run(project, "grouped.mcap", "--speed", "max", "--one-process") == expected
     lines = (project / "own.yaml").read_text().splitlines()
     lines[4], lines[5] = lines[5], lines[4]  # now `doubler` comes first
     (project / "own.yaml").write_text("\n".join(lines))
@@ -279,3 +284,20 @@ def test_rows_of_an_unknown_type_have_a_column_per_element_of_a_vector() -> None
         [8, 1, None, None, '[{"at": 1}]', "left", None],
     ]
     assert list(untyped_rows(iter([]), schema)) == []
+
+
+@pytest.mark.parametrize(
+    ("said", "refused"),
+    [
+        ("mine.Range/1", False),
+        ("mine.Range/2", True),
+        ("caneflow.Imu/1", True),
+        ("", False),
+        ("application/msgpack", False),
+    ],
+)
+def test_a_sample_that_says_another_schema_is_refused(said: str, refused: bool) -> None:
+    wire = InputPlan(key="f/a/range", schema="mine.Range/1", writer="a")
+    arrived = Arrived(node="b", port="range", payload=b"", schema=said)
+    with pytest.raises(MessageError, match="the port takes") if refused else nullcontext():
+        check_schema(arrived, wire)
