@@ -19,6 +19,7 @@ import msgspec
 from annotated_types import Ge, Le
 
 from caneflow.algorithms.quantities import Milliseconds, Time
+from caneflow.errors import not_installed
 from caneflow.messages import Imu
 from caneflow.protocols import bno055
 from caneflow.protocols.bno055 import CalibrationProfile, Measurement, Mode
@@ -407,7 +408,7 @@ def _i2c(settings: Bno055Settings) -> Iterator[Link]:
 
 
 def _missing(package: str) -> DataflowError:
-    return DataflowError(f"{package} is not installed; it comes with `pip install caneflow[devices]`")
+    return DataflowError(not_installed(package, "devices"))
 
 
 def read_profile(path: Path) -> CalibrationProfile | None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.clocks.clock_fit import ClockFitSettings, LineBelow
 from caneflow.algorithms.quantities import Time
+from caneflow.errors import not_installed
 from caneflow.messages import DopplerBlock, bounds
 from caneflow.protocols.doppler_blocks import BlockCutter, ModuleChannels, Samples, block_length
 from caneflow.recording.sound_file import SoundFile
@@ -318,7 +319,7 @@ def _portaudio() -> Any:
     try:
         import sounddevice  # type: ignore[import-untyped]  # it has no types
     except ImportError as error:
-        raise DataflowError("sounddevice is not installed; it comes with `pip install caneflow[audio]`") from error
+        raise DataflowError(not_installed("sounddevice", "audio")) from error
     except OSError as error:
         raise DataflowError("PortAudio is not installed; sudo apt install libportaudio2") from error
     # PortAudio looks for cards when it is started, and never again.

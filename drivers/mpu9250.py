@@ -16,6 +16,7 @@ from typing import Annotated, Literal, TypeAlias
 from annotated_types import Ge, Le
 
 from caneflow.algorithms.quantities import MagneticField, Time
+from caneflow.errors import not_installed
 from caneflow.messages import Imu
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.mounting import mounting
@@ -269,7 +270,7 @@ def opened_bus(number: int) -> Iterator[Transfer]:
     try:
         import smbus2
     except ImportError as error:
-        raise DataflowError("smbus2 is not installed; it comes with `pip install caneflow[devices]`") from error
+        raise DataflowError(not_installed("smbus2", "devices")) from error
 
     with smbus2.SMBus(number) as bus:
 

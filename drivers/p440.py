@@ -18,6 +18,7 @@ from annotated_types import Ge, Le
 
 from caneflow.algorithms.clocks.clock_fit import ClockFit
 from caneflow.algorithms.quantities import Time
+from caneflow.errors import not_installed
 from caneflow.messages import RadarFrame, bounds
 from caneflow.protocols import mrm
 from caneflow.protocols.errors import ProtocolError
@@ -195,7 +196,7 @@ class SerialLink(Link):
         try:
             import serial
         except ImportError as error:
-            raise DataflowError("a radar on a serial link needs pyserial: pip install 'caneflow[devices]'") from error
+            raise DataflowError(not_installed("pyserial", "devices")) from error
         self._port = serial.Serial(device, BAUD_RATE, exclusive=True)
         self._crc = crc
         self._deframer = SerialDeframer(crc=crc)

@@ -26,6 +26,7 @@ from caneflow.algorithms.cane.luenberger import LuenbergerSettings
 from caneflow.algorithms.cane.luenberger_fixed import observer_constants
 from caneflow.algorithms.clocks.clock_fit import ClockFit, ClockFitSettings
 from caneflow.algorithms.quantities import Milliseconds, Time
+from caneflow.errors import not_installed
 from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, Sample, decode, encode
 from caneflow.protocols import uart_frames
 from caneflow.protocols.errors import ProtocolError
@@ -324,7 +325,7 @@ class SerialLine:
         try:
             import serial
         except ImportError as error:
-            raise DataflowError("pyserial is not installed; it comes with `pip install caneflow[devices]`") from error
+            raise DataflowError(not_installed("pyserial", "devices")) from error
         try:
             self._port = serial.serial_for_url(
                 settings.port, settings.baud, timeout=READ_TIME, write_timeout=WRITE_TIME, exclusive=True

@@ -298,7 +298,7 @@ def test_a_library_that_is_missing_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     status, _, err = caneflow("export", recording, "--format", form, "-o", tmp_path / "out")
     assert status == 2
-    assert f"it comes with `pip install caneflow[{extra}]`" in err
+    assert f"`pip install 'caneflow[{extra}]'` brings it" in err
 
 
 def test_a_bag_that_is_there_is_not_written_over(caneflow: Callable[..., Run], recording: Path, tmp_path: Path) -> None:

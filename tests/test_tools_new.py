@@ -65,6 +65,13 @@ def test_what_is_there_is_not_written_over(caneflow: Callable[..., Run], tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["test_smooth.py"]
 
 
+def test_a_word_of_python_is_no_name_for_a_file(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    status, _, err = caneflow("new", "operator", "class", "--folder", tmp_path)
+    assert status == 2
+    assert "'class' is a word of Python's own" in err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", ["Smooth", "9x", "a-b", "../x", "a.b"])
 def test_a_name_that_is_no_nodes_is_refused(caneflow: Callable[..., Run], tmp_path: Path, name: str) -> None:
     status, out, err = caneflow("new", "driver", name, "--folder", tmp_path)

@@ -25,7 +25,7 @@ from rich.progress import track
 import caneflow
 from caneflow.algorithms.judging.error_summary import TABLE_I, ErrorSummary, consistent_mean, summarized
 from caneflow.algorithms.judging.track_errors import aligned
-from caneflow.errors import CaneflowError
+from caneflow.errors import CaneflowError, not_installed
 from caneflow.options import Overwrite
 from caneflow.outputs import made_folder, whole
 from caneflow.runtime.dataflow.loading import load
@@ -397,7 +397,7 @@ def _pyplot() -> Any:
         import matplotlib
         from matplotlib import pyplot
     except ImportError as error:
-        raise CaneflowError("the pictures need matplotlib: pip install 'caneflow[plot]'") from error
+        raise CaneflowError(not_installed("matplotlib", "plot")) from error
     matplotlib.use("Agg")
     return pyplot
 

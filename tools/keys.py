@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from caneflow.errors import not_installed
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
@@ -98,7 +99,7 @@ def _need_library() -> None:
     try:
         import cryptography  # noqa: F401 - is it there?
     except ImportError as error:
-        raise DataflowError("needs the package cryptography; pip install 'caneflow[secure]'") from error
+        raise DataflowError(not_installed("cryptography", "secure")) from error
 
 
 commands = {"init": init, "add": add, "list": show, "router": router}

@@ -1,6 +1,7 @@
 """`caneflow new`: a program or a message of your own that works, with its test and the line that uses it."""
 
 import sys
+from keyword import iskeyword
 from pathlib import Path
 from typing import Annotated
 
@@ -309,6 +310,8 @@ def _write_files(name: str, folder: Path, program: str, test: str, *, overwrite:
     """Write both files; gives the name of the class in them."""
     if not NAME.fullmatch(name):
         raise CaneflowError(f"{name!r} is not a valid name: expected {NAME_RULE}")
+    if iskeyword(name):
+        raise CaneflowError(f"{name!r} is a word of Python's own; a file of this name cannot be imported")
     files = {folder / f"{name}.py": program, folder / f"test_{name}.py": test}
     for path in files:
         require_free(path, overwrite=overwrite)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.judging.track_errors import START_NS, Track, boresight_yaws, track_errors
 from caneflow.algorithms.rotations import Vector
-from caneflow.errors import CaneflowError
+from caneflow.errors import CaneflowError, not_installed
 from caneflow.messages import DopplerBlock, GroundSpeed, Imu, Pose, RadarFrame
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
@@ -255,7 +255,7 @@ def draw(picture: Picture) -> "Figure":
         from matplotlib import rcParams
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
-        raise CaneflowError(f"no {error.name} here; `pip install 'caneflow[plot]'` brings it") from error
+        raise CaneflowError(not_installed(str(error.name), "plot")) from error
 
     rcParams["text.parse_math"] = False  # a name with a $ is a name
     panels = list(_panels(picture))

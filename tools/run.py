@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from caneflow.errors import not_installed
 from caneflow.messages.control import Counters
 from caneflow.options import Overwrite
 from caneflow.outputs import named_at, require_folder, require_no_input, reserved
@@ -216,7 +217,7 @@ def _require_processes(*, in_process: bool, view: bool, detach: bool) -> None:
         option = "--view" if view else "--detach"
         raise DataflowError(f"{option}: nobody can attach to a flow in one process; leave --in-process out")
     if view and find_spec("uvicorn") is None:
-        raise DataflowError("--view: no uvicorn here; `pip install 'caneflow[view]'` brings it")
+        raise DataflowError(f"--view: {not_installed('uvicorn', 'view')}")
 
 
 def _listen(endpoint: str | None, *, in_process: bool) -> str | None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from annotated_types import Ge, Le
 
-from caneflow.errors import CaneflowError
+from caneflow.errors import CaneflowError, not_installed
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.control import FlowStatus
 from caneflow.messages.registry import SCHEMA
@@ -175,7 +175,7 @@ def serving(feed: "Feed", port: int) -> Iterator["PageServer"]:
     try:
         from caneflow.viewing.server import PageServer
     except ModuleNotFoundError as error:
-        raise CaneflowError(f"no {error.name} here; `pip install 'caneflow[view]'` brings it") from error
+        raise CaneflowError(not_installed(str(error.name), "view")) from error
     with PageServer(feed, port=port) as server:
         yield server
 

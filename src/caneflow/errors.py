@@ -10,3 +10,8 @@ CaneflowError
 
 class CaneflowError(Exception):
     """Says where, what was found and what would be right, in one line."""
+
+
+def not_installed(package: str, extra: str) -> str:
+    """The line for a package that is not there, in the one wording: quoted, as some shells read brackets otherwise."""
+    return f"{package} is not installed; `pip install 'caneflow[{extra}]'` brings it"

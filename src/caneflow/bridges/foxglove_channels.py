@@ -25,10 +25,11 @@ from caneflow.bridges.ros_messages import (
     motion_covariance,
     place_covariance,
 )
+from caneflow.errors import not_installed
 from caneflow.messages import Pose, Sample, json_schema
 from caneflow.messages.control import FlowStatus
 
-MISSING = "foxglove-sdk is not installed; it comes with `pip install caneflow[foxglove]`"
+MISSING = not_installed("foxglove-sdk", "foxglove")
 TRACK_PERIOD = 1_000_000_000  # ns between two tracks: each is sent whole
 TRACK_STEP = 0.05  # m between two points of a track
 MOST_POINTS = 20_000  # of a track: 1 km of points; then every other one goes, and the step is doubled

@@ -8,8 +8,9 @@ import struct
 from typing import Final, NamedTuple
 
 from caneflow.bridges.errors import BridgeError
+from caneflow.errors import not_installed
 
-MISSING = "xxhash is not installed; it comes with `pip install caneflow[ros2]`"
+MISSING = not_installed("xxhash", "ros2")
 ROUTER: Final = "tcp/127.0.0.1:7447"  # where rmw_zenohd listens
 MOST_DOMAINS: Final = 232  # ROS_DOMAIN_ID: beyond, DDS has no ports
 NODE, PUBLISHER, SUBSCRIPTION = "NN", "MP", "MS"

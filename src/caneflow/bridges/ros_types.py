@@ -4,8 +4,9 @@ from functools import cache
 from typing import Any
 
 from caneflow.bridges.errors import BridgeError
+from caneflow.errors import not_installed
 
-MISSING = "rosbags is not installed; it comes with `pip install caneflow[ros2]`"
+MISSING = not_installed("rosbags", "ros2")
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
 DEFAULT_DISTRO = "jazzy"
 NO_HASHES = "humble"  # which knows none: rmw_zenoh has this word in their place there

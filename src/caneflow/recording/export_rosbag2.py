@@ -9,11 +9,12 @@ from typing import Any, Final
 from caneflow.bridges.frames import frames_of
 from caneflow.bridges.ros_messages import TF_TYPE, Picture, RosMessages, tf_stream
 from caneflow.bridges.ros_types import RosTypes
+from caneflow.errors import not_installed
 from caneflow.messages import SAMPLES
 from caneflow.recording.errors import RecordingError
 from caneflow.recording.reader import Recording
 
-MISSING = "rosbags is not installed; it comes with `pip install caneflow[rosbag2]`"
+MISSING = not_installed("rosbags", "rosbag2")
 BAG_VERSION: Final = 8  # what Humble and all later releases read
 DISTRO: Final = "humble"  # the oldest that is meant to read it; the types used here are the same up to Lyrical
 

@@ -5,13 +5,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from caneflow.errors import not_installed
 from caneflow.protocols.doppler_blocks import BlockCutter, ModuleChannels, Samples, block_length, is_finite
 from caneflow.recording.errors import RecordingError
 
 SHORT = {"PCM_16", "PCM_S8", "PCM_U8"}  # what 16 bits hold exactly; the rest is read as float32
 READ_FRAMES = 1 << 16  # at a time
 MOST_CHANNELS = 256
-MISSING = "soundfile is not installed; it comes with `pip install caneflow[audio]`"
+MISSING = not_installed("soundfile", "audio")
 
 
 class SoundBlock(NamedTuple):

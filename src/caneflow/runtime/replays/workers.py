@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from multiprocessing import connection, get_context, parent_process
 from typing import TypeVar
 
+from caneflow.errors import not_installed
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.wording import one_line
 
@@ -54,7 +55,7 @@ def mapped_on_cluster(
     try:
         from distributed import Client  # an extra, and slow to import
     except ImportError:
-        raise DataflowError("--scheduler needs Dask: pip install 'caneflow[cluster]'") from None
+        raise DataflowError(f"--scheduler: {not_installed('distributed', 'cluster')}") from None
     try:
         client = Client(scheduler, timeout=timeout, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
