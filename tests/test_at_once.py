@@ -13,7 +13,7 @@ import zenoh
 from caneflow.messages import GroundSpeed, Imu, Sample, numbered
 from caneflow.messages.control import Again, PortMark, Progress
 from caneflow.runtime import Emitted, Operator
-from caneflow.runtime.hosts.process import inputs, process, quickness, recovery, reports
+from caneflow.runtime.hosts.process import inputs, process, quickness, recovery, reports, sayings
 from caneflow.runtime.hosts.process.events import (
     Arrived,
     AskEnded,
@@ -117,7 +117,7 @@ class Bus:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (process, inputs, quickness, recovery, reports):
+    for module in (process, inputs, quickness, recovery, reports, sayings):
         monkeypatch.setattr(module, "time", clock)
     return clock
 

@@ -193,6 +193,12 @@ class Group:
         names = {reader for (name, _), wires in self._wires.items() if name == node for reader, _ in wires}
         return [self.readers[name] for name in names]
 
+    def idle(self, time: int) -> None:
+        """Give the sinks a moment when nothing comes, at `time` (ns)."""
+        for reader in self.readers.values():
+            if isinstance(reader, Tap):
+                reader.idle(time)
+
     def finish(self) -> None:
         """End the sinks, each once."""
         for reader in self.readers.values():

@@ -119,8 +119,6 @@ class Launcher:
             self._conclude()
         return self._outcome
 
-    # --- the other machines -----------------------------------------------------------------------------------
-
     def _gather(self) -> bool:
         """Wait until every machine of the flow is there; False when the run ends before."""
         companions = self._companions
@@ -167,8 +165,6 @@ class Launcher:
                     self._companions.take(event)
         if self._state_folder is not None and not self._outcome.failures:
             remove_state_folder(self._state_folder)
-
-    # --- what comes -------------------------------------------------------------------------------------------
 
     def _follow(self) -> None:
         """Take events until the run has ended, well or badly."""
@@ -241,8 +237,6 @@ class Launcher:
             if self._view:
                 words = ("view", self._deployment.flow, "--at", self._endpoint, "--open")
                 self._processes.start_program(PAGE, ("-m", "caneflow.words", *words))
-
-    # --- what goes out ----------------------------------------------------------------------------------------
 
     def _start(self, node: NodeState) -> None:
         folder = self._directory.path

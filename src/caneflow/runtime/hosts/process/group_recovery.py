@@ -17,7 +17,6 @@ from caneflow.runtime.stages.group_snapshot import GroupState
 from caneflow.runtime.stages.journal import Brought, Journal
 from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.references import SnapshotError
-from caneflow.runtime.stages.sink_stage import Tap
 from caneflow.runtime.stages.snapshot_file import SnapshotFile
 from caneflow.runtime.wording import one_line
 
@@ -78,7 +77,7 @@ class GroupRecovery:
             fresh = stand != self._last
             self._next = math.inf  # until this one is kept
             if fresh:
-                self._flush()
+                self._group.idle(time.time_ns())  # what sinks have taken up to here is not brought again
             number = self._journal.begin() if fresh and self._journal is not None else 0
             snapshot = self._state.taken(number) if fresh else None
         self._keeps = not fresh or self._is_kept(snapshot)  # without the lock: samples do not wait for the disk
@@ -130,12 +129,6 @@ class GroupRecovery:
     def _stand(self) -> object:
         sent = {name: feed.state() for name, feed in self._group.feeds.items()}
         return self._handled(), sent
-
-    def _flush(self) -> None:
-        """What sinks have taken up to here is not brought again."""
-        for reader in self._group.readers.values():
-            if isinstance(reader, Tap):
-                reader.idle(time.time_ns())
 
     def _is_kept(self, snapshot: bytes | None) -> bool:
         """Keep a snapshot, or None for a state that cannot be kept; as in Recovery."""

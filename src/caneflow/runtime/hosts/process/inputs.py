@@ -118,7 +118,8 @@ class Inputs:
     def note_local(self, port: str, message: Sample) -> int:
         """Note that a sample comes from a node of this process; the time (ns) at which it does."""
         now = time.time_ns()
-        self._delays[port].note(now, now, message.stamp)
+        if not self._plan.replay:
+            self._delays[port].note(now, now, message.stamp)
         self.note_others(port, message.stamp)
         return now
 

@@ -16,6 +16,8 @@ from caneflow.runtime.stages import journal
 from caneflow.runtime.stages.byte_budget import WAITING
 from caneflow.runtime.stages.group import Group
 
+BATCH = 32  # samples of a replay that are handled together
+
 
 class Host(Protocol):
     """The process, as its sources' threads see it."""
@@ -30,8 +32,8 @@ class Host(Protocol):
     def quick(self) -> bool:
         """Whether what comes is handled on the thread that brings it."""
 
-    def do(self, work: Callable[[], None]) -> None:
-        """Do something with the lock held, and what follows."""
+    def do(self, work: Callable[[], None], *, follow: bool = True) -> None:
+        """Do something with the lock held, and what follows; in a replay only if `follow`."""
 
     def step(self, now: int | None) -> bool:
         """Handle the next sample that is due; whether there was one."""
@@ -48,10 +50,15 @@ class LocalSources:
         self._replay = host.plan.replay
         self._feeds = host.group.feeds
         self._present = Present()
+        self._brought = 0  # samples of a replay
+        self._readers = {node: host.group.readers_of(node) for node in self._feeds}
 
     def bring(self, node: str, port: str, sample: Sample | Encoded) -> None:
         """Take a sample, and do what follows; by the inbox while the process is not quick."""
-        if self._host.quick or self._replay:
+        if self._replay:  # what is not handled here the process's own thread handles soon
+            self._brought += 1
+            self._host.do(partial(self.take, node, port, sample), follow=self._brought % BATCH == 0)
+        elif self._host.quick:
             self._host.do(partial(self.take, node, port, sample))
         else:
             self._host.bus.put(Brought(node, port, sample))
@@ -65,7 +72,7 @@ class LocalSources:
         if not self._replay:
             return True
         full = self._host.outputs[node].full
-        return not full and all(reader.held < WAITING // 2 for reader in self._host.group.readers_of(node))
+        return not full and all(reader.held < WAITING // 2 for reader in self._readers[node])
 
     def source_ended(self, node: str) -> None:
         """Take a source's word that nothing more will come."""

@@ -94,16 +94,15 @@ class Process:
         with self.lock:
             for outputs in self.outputs.values() if resumed else ():
                 outputs.send_again()  # what came since the snapshot is asked for
-            for recovery in self._recoveries:
-                self.local.catch_up(recovery.brought_since())
+            self.local.catch_up(brought for recovery in self._recoveries for brought in recovery.brought_since())
         self.sources.begin()
         more = False
         while not self.stopped:
             came = self.take_events(timeout=0 if more else self.look_period)
             with self.lock:
                 self.raise_if_broken()
-                for tap in () if came else self.taps.values():
-                    tap.idle(time.time_ns())
+                if not came:
+                    self.group.idle(time.time_ns())
                 self.group.tell_all_marks()
                 more = self.handle_what_is_due()
                 self.ask_for_missing()
@@ -227,15 +226,16 @@ class Process:
         """Whether what comes is handled on the thread that brings it."""
         return self._quickness.holds
 
-    def do(self, work: Callable[[], None]) -> None:
-        """Do something that a source has caused, and what follows, on its thread."""
+    def do(self, work: Callable[[], None], *, follow: bool = True) -> None:
+        """Do something that a source has caused, and what follows, on its thread; in a replay only if `follow`."""
         with self.lock:
             if self.stopped or self._broken is not None:
                 return
             if self.plan.replay:
                 work()
-                self._follow_up()
-                self._between_samples()
+                if follow:
+                    self.handle_what_is_due()
+                    self._between_samples()
             else:
                 began = self._quickness.begin()
                 work()
@@ -301,8 +301,6 @@ class Process:
             self._send(*stepped)
         return stepped is not None
 
-    # --- what follows -----------------------------------------------------------------------------------------
-
     def handle_what_is_due(self) -> bool:
         """Handle samples until none is due, or for so long that all else would wait; whether more may be due."""
         until = time.monotonic() + self.look_period
@@ -337,6 +335,8 @@ class Process:
 
     def _say_if_due(self) -> None:
         """While samples come without end: say how far each node has come, and ask for what a sink is missing."""
+        if not self.says.may_be_due():
+            return
         for name in self.says.progress_that_is_due():
             if name in self.taps:
                 self.ask_for_missing()

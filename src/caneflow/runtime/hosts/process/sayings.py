@@ -1,5 +1,6 @@
 """What a process says of its nodes: how far each has come, what it has counted, what it left out."""
 
+import time
 from collections.abc import Iterator, Mapping
 
 import msgspec
@@ -9,11 +10,13 @@ from caneflow.runtime.hosts.process.bus import Bus
 from caneflow.runtime.hosts.process.group_recovery import AnyRecovery
 from caneflow.runtime.hosts.process.inputs import Inputs
 from caneflow.runtime.hosts.process.outputs import Outputs
-from caneflow.runtime.hosts.process.reports import Reports
+from caneflow.runtime.hosts.process.reports import REPORT_PERIOD, Reports
 from caneflow.runtime.hosts.process.sources import counted
 from caneflow.runtime.plan import ProcessPlan
 from caneflow.runtime.stages.group import Group
 from caneflow.runtime.stages.operator_stage import Stage
+
+LOOK_PERIOD = REPORT_PERIOD / 8  # s
 
 
 class Sayings:
@@ -29,6 +32,7 @@ class Sayings:
         recovery: Mapping[str, AnyRecovery],
     ) -> None:
         self.reports = {name: Reports(bus, replay=plan.replay) for name in plan.members}
+        self._look_at = 0.0  # s, monotonic
         self._plan = plan
         self._bus = bus
         self._group = group
@@ -87,6 +91,14 @@ class Sayings:
                 let_go=history.let_go if history else 0,
             )
         )
+
+    def may_be_due(self) -> bool:
+        """Whether it is time to look what is to be said, while samples come without end."""
+        now = time.monotonic()
+        if now < self._look_at:
+            return False
+        self._look_at = now + LOOK_PERIOD
+        return True
 
     def progress_that_is_due(self) -> Iterator[str]:
         """Say how far those nodes have come for which that is due; yields each."""
