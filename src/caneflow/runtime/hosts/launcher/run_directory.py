@@ -91,6 +91,13 @@ class RunDirectory:
         """Whether the folder and the launcher's socket are where they were made: a cleaner may have removed them."""
         return self.folder.is_there and (self._socket is None or self._socket.exists())
 
+    def without_it(self, links: str) -> str:
+        """What follows when it has been removed, where the nodes' links are `links`."""
+        lost = "tools cannot find it by its name any more"
+        if links == "unix":
+            lost = "tools cannot attach any more, and a node that ends cannot start again"
+        return f"{self.path} was removed: the flow goes on, but {lost}"
+
 
 def running_flows() -> list[RunningFlow]:
     """The flows that run on this machine and that this user may believe: the own ones; root sees all."""
