@@ -18,6 +18,7 @@ from annotated_types import Ge, Le
 
 from caneflow.algorithms.clocks.clock_fit import ClockFit
 from caneflow.algorithms.quantities import Time
+from caneflow.algorithms.radar.received_carrier import CarrierMeter
 from caneflow.errors import not_installed
 from caneflow.messages import RadarFrame, bounds
 from caneflow.protocols import mrm
@@ -52,6 +53,7 @@ RAW = 1  # scan type: neither filtered nor detected
 LOSS_PERIOD = 30.0  # s between two lines about losses
 FIRST_LOSS_LINE = 2.0  # s after the start, when it is known how often the radar scans
 CLOCK_SET = 1_000_000  # ns by which the host's clock must differ from what it was to have been set
+NOMINAL_CARRIER = 4.3e9  # Hz, the middle of what a P440 transmits, 3.1 to 4.8 GHz at -10 dB
 TICKS_PER_SECOND = 1e3  # of the radar's clock
 
 Picoseconds = Annotated[int, Ge(-499_998), Le(499_998)]
@@ -77,9 +79,8 @@ class P440Settings:
     transmit_gain: Annotated[int, Ge(0), Le(63)] = 63  # 0..63; the regulator may ask for less
     antennas: Literal["a", "b", "a_to_b", "b_to_a"] = "a_to_b"  # transmits by the first, receives by the last
     antenna_delay_ps: Annotated[int, Ge(0), Le(100_000)] = 10_000  # ps of path in the antennas, both ways
-    carrier: Annotated[float, Ge(bounds.CARRIER[0]), Le(bounds.CARRIER[1])] = (
-        4.3e9  # Hz, effective centre of the received band
-    )
+    # Hz, effective centre of the received band; default: 4.3 GHz until it has been measured on echoes that move
+    carrier: Annotated[float, Ge(bounds.CARRIER[0]), Le(bounds.CARRIER[1])] | None = None
     bandwidth: Annotated[float, Ge(bounds.BANDWIDTH[0]), Le(bounds.BANDWIDTH[1])] = 1.7e9  # Hz, at -10 dB
     silence_s: Time = 0.5  # s without a packet after which the radar is started anew
 
@@ -316,6 +317,8 @@ class Framing:
         self._settings = settings
         self._clock = clock
         self._fit = ClockFit(period=settings.nominal_period)
+        self._carrier = settings.carrier or NOMINAL_CARRIER
+        self._meter = None if settings.carrier else CarrierMeter()
         self._held: list[tuple[int, Scan]] = []  # with stamps, as long as the period is not known
         self.scans = 0  # that came whole
         self.unfit = 0  # of them: no raw scan, nothing in it, or from where no radar scans
@@ -349,7 +352,17 @@ class Framing:
             return
         held, self._held = self._held, []
         for stamp, one in held:
+            self._measure(stamp, one)
             yield self._frame(stamp, one, period)
+
+    def _measure(self, stamp: int, scan: Scan) -> None:
+        """Take the carrier from the scans, once; a setting overrides."""
+        found = self._meter.update(1e-9 * stamp, scan.samples, scan.range_step) if self._meter else None
+        if found is None:
+            return
+        self._meter, self._carrier = None, found.carrier
+        giga = [value / 1e9 for value in (found.carrier, found.error, found.spread)]
+        log.info("carrier %.3f +- %.3f GHz, measured on %d echoes (sd %.3f)", *giga[:2], found.echoes, giga[2])
 
     def _frame(self, stamp: int, scan: Scan, period: float) -> RadarFrame:
         return RadarFrame(
@@ -358,7 +371,7 @@ class Framing:
             scan_period=period,
             range_start=scan.range_start(self._settings.antenna_delay_ps),
             range_step=scan.range_step,
-            carrier=self._settings.carrier,
+            carrier=self._carrier,
             bandwidth=self._settings.bandwidth,
         )
 

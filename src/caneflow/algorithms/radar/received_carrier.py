@@ -26,9 +26,11 @@ SLOWEST = 0.15  # m/s: a slower echo moves too little in a window
 FASTEST_TURN = 0.35  # turns between two scans, beyond which the sign of a Doppler frequency may be wrong
 CLEAR = 12.0  # times the median magnitude of the map
 COHERENT = 0.3  # of what an echo of a single speed would give; several in one place have less
+LEAST_LINES = 8  # of fast time in the band; fewer are no spectrum
 GATE = 0.5  # m to either side of an echo
 ECHOES = 4  # per window, at most
 LEAST = 6  # echoes that a measurement takes
+SETTLED, SETTLED_ERROR = 12, 0.01  # echoes and relative error from which on a radar that runs is told its carrier
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,11 @@ class ReceivedCarrier:
         """Hz, standard error; overlapping windows count half."""
         return self.spread / math.sqrt(max(0.5 * self.echoes, 1.0))
 
+    @property
+    def settled(self) -> bool:
+        """Whether it is known to 1 %."""
+        return self.error <= SETTLED_ERROR * self.carrier
+
 
 def received_carrier(
     scans: NDArray[np.number], times: Floats, range_step: float, *, hop: int = WINDOW // 4
@@ -52,17 +59,37 @@ def received_carrier(
 
     Windows whose scans are not evenly spaced, within a third of a period, are left out.
     """
-    frequencies = fft.rfftfreq(scans.shape[1], 2.0 * range_step / SPEED_OF_LIGHT)
-    inside = (frequencies > BAND[0]) & (frequencies < BAND[1])
-    if len(scans) < WINDOW or np.count_nonzero(inside) < 8:
+    if len(scans) < WINDOW:
         return None
     usual = float(np.median(np.diff(times)))
     pairs = [
         pair
         for first in range(0, len(scans) - WINDOW + 1, hop)
-        for pair in _echoes(scans[first : first + WINDOW], times[first : first + WINDOW], usual, range_step, inside)
+        for pair in echoes(scans[first : first + WINDOW], times[first : first + WINDOW], usual, range_step)
     ]
     return _carrier_of(np.array(pairs)) if len(pairs) >= LEAST else None
+
+
+class CarrierMeter:
+    """The same while scans come, in one window of two, until the standard error is within 1 %."""
+
+    def __init__(self) -> None:
+        self._scans: list[tuple[float, NDArray[np.number]]] = []
+        self._pairs: list[tuple[float, float]] = []
+
+    def update(self, time: float, scan: NDArray[np.number], range_step: float) -> ReceivedCarrier | None:
+        """The carrier, once, after a scan (bins,) at `time` s that settles it; None before."""
+        if self._scans and (len(scan) != len(self._scans[-1][1]) or time <= self._scans[-1][0]):
+            self._scans.clear()
+        self._scans.append((time, scan))
+        if len(self._scans) < 2 * WINDOW:
+            return None
+        times, scans = zip(*self._scans[WINDOW:], strict=True)
+        self._scans.clear()
+        block = np.stack(scans).astype(np.float32)
+        self._pairs += echoes(block, np.array(times), float(np.median(np.diff(times))), range_step)
+        found = _carrier_of(np.array(self._pairs)) if len(self._pairs) >= SETTLED else None
+        return found if found is not None and found.echoes >= SETTLED and found.settled else None
 
 
 def _carrier_of(pairs: Floats) -> ReceivedCarrier | None:
@@ -80,10 +107,12 @@ def _carrier_of(pairs: Floats) -> ReceivedCarrier | None:
     )
 
 
-def _echoes(
-    scans: NDArray[np.number], times: Floats, usual: float, range_step: float, inside: NDArray[np.bool_]
-) -> list[tuple[float, float]]:
-    """Doppler frequency (Hz) and speed (m/s) of the strongest echoes of one window."""
+def echoes(scans: NDArray[np.number], times: Floats, usual: float, range_step: float) -> list[tuple[float, float]]:
+    """Doppler frequency (Hz) and speed (m/s) of the strongest echoes of one window of scans `usual` s apart."""
+    frequencies = fft.rfftfreq(scans.shape[1], 2.0 * range_step / SPEED_OF_LIGHT)
+    inside = (frequencies > BAND[0]) & (frequencies < BAND[1])
+    if np.count_nonzero(inside) < LEAST_LINES:
+        return []
     intervals = np.diff(times)
     period = float(intervals.mean())
     if np.abs(np.cumsum(intervals - period)).max() > 0.6 * usual or abs(period / usual - 1.0) > 0.05:
