@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.doppler_module import (
+    REAL_AMPLIFIER,
     Kind,
     Module,
     ModuleSettings,
@@ -172,6 +173,14 @@ def test_the_noise_is_white_and_one_over_f() -> None:
     for frequency in (20.0, 60.0, 150.0, 500.0, 1500.0):
         expected = white_density(SETTINGS) * (1.0 + 150.0 / frequency)
         assert density(samples, frequency, 0.2 * frequency) == pytest.approx(expected, rel=0.15)
+
+
+def test_a_real_amplifier_adds_what_it_says_below_its_corner_and_nothing_above() -> None:
+    samples = noise(60 * SAMPLE_RATE, REAL_AMPLIFIER, default_rng(1))
+    for frequency in (10.0, 20.0, 30.0, 60.0, 150.0, 500.0):
+        rise = 10.0**2.8 / (1.0 + (frequency / 30.0) ** 6)
+        expected = white_density(SETTINGS) * (1.0 + 150.0 / frequency + rise)
+        assert density(samples, frequency, 0.1 * frequency) == pytest.approx(expected, rel=0.25)
 
 
 def test_an_empty_room_is_noise_and_hum_within_the_band() -> None:

@@ -106,7 +106,10 @@ def room(
     course: Annotated[RoomShape, typer.Option(help="Where the person walks.")] = "circle",
     modules: Annotated[Kind, typer.Option(help="One mixer (int16) or two (complex64).")] = "real",
     sensors: Annotated[int, typer.Option(min=2, max=len(SENSORS), help=f"The first of {', '.join(SENSORS)}.")] = 2,
-    world: Annotated[World, typer.Option(help="How strongly floor and walls reflect.")] = "nominal",
+    world: Annotated[
+        World,
+        typer.Option(help="How strongly floor and walls reflect; `field`: nominal, with the noise of real amplifiers."),
+    ] = "nominal",
     part: Annotated[
         Literal[Part, "all"], typer.Option(help="The empty room, a calibration walk along an axis, or the course.")
     ] = "all",
@@ -137,7 +140,10 @@ def cane_in_room(
     seed: Annotated[int, typer.Option(min=0, help="Of installation, person, cane and walk.")] = 1,
     modules: Annotated[Kind, typer.Option(help="One mixer (int16) or two (complex64).")] = "real",
     sensors: Annotated[int, typer.Option(min=2, max=len(SENSORS), help=f"The first of {', '.join(SENSORS)}.")] = 2,
-    world: Annotated[World, typer.Option(help="How strongly floor and walls reflect.")] = "nominal",
+    world: Annotated[
+        World,
+        typer.Option(help="How strongly floor and walls reflect; `field`: nominal, with the noise of real amplifiers."),
+    ] = "nominal",
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate somebody with a white cane in a room of Doppler modules: both sensor sets, and where the person was.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from caneflow.simulation.attitude import DEGREE, Floats, from_rotation_vector
 from caneflow.simulation.belt_imu import BeltImuSettings, BeltSamples, belt, measure
 from caneflow.simulation.doppler_module import (
+    REAL_AMPLIFIER,
     Complexes,
     Kind,
     Module,
@@ -43,7 +44,7 @@ from caneflow.simulation.room_course import (
 from caneflow.simulation.room_walk import Gait, Person, PersonSettings, body, gait, person, seen_from
 from caneflow.simulation.scenario import EPOCH_NS
 
-World: TypeAlias = Literal["nominal", "harsh"]
+World: TypeAlias = Literal["nominal", "harsh", "field"]
 Part: TypeAlias = Literal["empty", "axial_x", "axial_y", "course"]
 WORLDS: tuple[World, ...] = get_args(World)
 PARTS: tuple[Part, ...] = get_args(Part)
@@ -155,6 +156,7 @@ def room_settings(
         modules=modules,
         sensors=sensors,
         reflections=HARSH if world == "harsh" else NOMINAL,
+        module=REAL_AMPLIFIER if world == "field" else ModuleSettings(),
     )
 
 
