@@ -44,7 +44,7 @@ class DopplerLineSettings:
     least_share: Probability = 0.25  # of the in-band energy above the floor
     half_width: Frequency = 8.0  # Hz to either side, that the share is taken from
     continuity: Decibels | Zero = 6.0  # dB that a line beside the last one may be weaker than another and still be it
-    follow: Decibels | Zero = 2.0  # dB below least_snr down to which a line that goes on counts
+    follow: Decibels | Zero = 2.0  # dB below least_snr down to which a line counts that has gone on for 0.3 s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,16 +84,17 @@ def predominant_line(spectrum: DopplerSpectrum, settings: DopplerLineSettings) -
 class LineFollower:
     """The predominant line from one spectrum to the next.
 
-    One that goes on from the last valid line is preferred, and counts from `follow` below `least_snr` on; a new one
-    has to stand above the floor by what the floor may be wrong as well. Nothing is valid while the floor is not
-    known, nor where the strongest line is beyond the band, nor on a harmonic of the mains that moves less than anybody
-    who walks.
+    One that goes on from the last valid line is preferred, and counts from `least_snr` on, once it has lasted from
+    `follow` below it on; a new one has to stand above the floor by what the floor may be wrong as well. Nothing is
+    valid while the floor is not known, nor where the strongest line is beyond the band, nor on a harmonic of the mains
+    that moves less than anybody who walks.
     """
 
     def __init__(self, settings: DopplerLineSettings) -> None:
         self._settings = settings
         self._last: float | None = None  # Hz, of the last valid line
         self._ago = math.inf  # s, how long it is ago
+        self._age = 0.0  # s, for how long the line has gone on
         self._steady_at = math.nan  # Hz
         self._steady_for = 0.0  # s
         self._slow_for = 0.0  # s that the strongest line has been at the band's lower end
@@ -110,13 +111,21 @@ class LineFollower:
         score[beside] += self._settings.continuity
         peak = _fundamental(spectrum, _peak(spectrum, _top(spectrum, int(np.argmax(score)))), self._settings)
         goes_on = bool(beside[peak.bin])
-        least = self._settings.least_snr + (-self._settings.follow if goes_on else spectrum.floor_slack)
+        least = self._least(spectrum, goes_on=goes_on)
         valid = _stands_out(spectrum, peak, self._settings, least)
         valid = not self._may_be_a_step(spectrum, peak, known=goes_on or not valid) and valid
         valid = not self._is_hum(spectrum, peak) and valid
         if valid:
+            self._age = self._age + self._ago if goes_on else 0.0
             self._last, self._ago = peak.frequency, 0.0
         return _line(spectrum, peak, valid=valid)
+
+    def _least(self, spectrum: DopplerSpectrum, *, goes_on: bool) -> float:
+        """How far (dB) a line has to stand over the floor: least where one goes on that no noise is that long."""
+        least = self._settings.least_snr
+        if not goes_on:
+            return least + spectrum.floor_slack
+        return least - self._settings.follow if self._age >= FOLLOWED else least
 
     def _beside(self, spectrum: DopplerSpectrum) -> NDArray[np.bool_]:
         """Which bins a line that goes on may have reached."""
