@@ -30,7 +30,7 @@ from caneflow.runtime.hosts.launcher.replay_progress import ReplayProgress
 from caneflow.runtime.hosts.launcher.replay_window import ReplayWindow
 from caneflow.runtime.hosts.launcher.requests import RestartAsked, requests
 from caneflow.runtime.hosts.launcher.restarts import How
-from caneflow.runtime.hosts.launcher.run_directory import LOST, RunDirectory, remove_state_folder, state_folder
+from caneflow.runtime.hosts.launcher.run_directory import RunDirectory, remove_state_folder, state_folder
 from caneflow.runtime.hosts.launcher.run_log import RunLog
 from caneflow.runtime.hosts.launcher.starting import plan_to_start, program_arguments
 from caneflow.runtime.hosts.launcher.stop_signals import Interrupted, stop_signals
@@ -272,9 +272,7 @@ class Launcher:
         """Say once that the folder of the run was removed, as cleaners do: links that are there go on."""
         if not (self._said_removed or self._directory.is_there):
             self._said_removed = True
-            self._say(
-                LAUNCHER, f"{self._directory.path} was removed: the flow goes on, but {LOST[self._deployment.links]}"
-            )
+            self._say(LAUNCHER, self._directory.without_it(self._deployment.links), "warning")
 
     def _look_at_deadlines(self) -> None:
         now = time.monotonic()

@@ -93,10 +93,7 @@ class RunDirectory:
 
     def without_it(self, links: str) -> str:
         """What follows when it has been removed, where the nodes' links are `links`."""
-        lost = "tools cannot find it by its name any more"
-        if links == "unix":
-            lost = "tools cannot attach any more, and a node that ends cannot start again"
-        return f"{self.path} was removed: the flow goes on, but {lost}"
+        return f"{self.path} was removed: the flow goes on, but {LOST[links]}"
 
 
 def running_flows() -> list[RunningFlow]:
