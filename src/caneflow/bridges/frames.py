@@ -91,5 +91,11 @@ def quaternion_of(matrix: np.ndarray) -> Quaternion:
 
 def matrix_of(rotation: Quaternion) -> np.ndarray:
     """The rotation as a matrix (3, 3)."""
-    columns = [rotate(rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
-    return np.array(columns).T
+    w, x, y, z = rotation
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+    )

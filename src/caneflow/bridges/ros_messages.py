@@ -299,17 +299,20 @@ def motion_covariance(pose: Pose, back: Quaternion) -> Any:
 
 
 def _speed_covariance(speed: GroundSpeed) -> Any:
+    covariance = _NOTHING_OBSERVED.copy()
     if speed.velocity is None:
-        return _whole(np.array([[speed.quality**2]]))
-    if speed.velocity_cov is None:
-        return _whole(np.zeros((2, 2)))
-    xx, xy, yy = speed.velocity_cov
-    return _whole(np.array([[xx, xy], [xy, yy]]))
+        covariance[0, 0] = speed.quality**2
+    else:
+        xx, xy, yy = speed.velocity_cov or (0.0, 0.0, 0.0)
+        covariance[:2, :2] = (xx, xy), (xy, yy)
+    return covariance.reshape(-1)
 
 
 def _whole(block: Any) -> Any:
-    """The 36 elements of a covariance with `block` (n, n) first, and behind it what is not observed."""
-    covariance = np.diag([NOT_OBSERVED] * 6)
-    n = len(block)
-    covariance[:n, :n] = block
+    """The 36 elements of a covariance with `block` (3, 3) first, and behind it what is not observed."""
+    covariance = _NOTHING_OBSERVED.copy()
+    covariance[:3, :3] = block
     return covariance.reshape(-1)
+
+
+_NOTHING_OBSERVED = np.diag([NOT_OBSERVED] * 6)
