@@ -13,7 +13,7 @@ import pytest
 
 from caneflow import command
 from caneflow.bridges.radar_images import SCANS, RadarImages
-from caneflow.messages import DopplerTarget, GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
+from caneflow.messages import DopplerTarget, Grid, GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
 from caneflow.recording import RecordingWriter
 
 START = 1_700_000_000_000_000_000  # ns
@@ -251,6 +251,45 @@ def test_a_post_at_2_m_ahead_and_half_a_metre_to_the_left_is_found_there(
             there.append(found["/fusion/pose/foxglove"][0][1].pose.position)
             there.append(found["/fusion/pose/track"][0][1].entities[0].lines[0].points[0])
         assert [(each.x, each.y) for each in there] == [(2.0, 0.5)] * len(there)
+
+
+@pytest.mark.parametrize("form", READERS)
+def test_a_post_in_a_grid_is_found_there(caneflow: Callable[..., Run], tmp_path: Path, form: str) -> None:
+    """A post at x = 2, y = 0.5 m in a grid of 10 cm cells that begins at x = -1, y = -3: cell 30, 35 of its slices."""
+    occupancy = np.full((3, 60, 80), 128, np.uint8)
+    occupancy[:, 10:50, 10:70] = 100  # seen, and free
+    occupancy[1, 30, 35] = 180
+    missing = np.full((60, 80), 128, np.uint8)
+    missing[40, 20] = 200  # a hole at x = 3, y = -1
+    grid = Grid(
+        stamp=START, occupancy=occupancy, unit=0.1, cell=0.1, bottom=0.0, slice=0.5, origin=(-10, -30),
+        pose_stamp=START, floor_missing=missing,
+    )  # fmt: skip
+    path, out = tmp_path / "grid.mcap", tmp_path / "out"
+    with RecordingWriter(path, flow="cane", source="live", rig={}) as writer:
+        writer.write("cane/map/grid", Grid, numbered(grid, 0), stamp=START, seq=0, log_time=START)
+    assert caneflow("export", path, "--format", form, "-o", out)[0] == 0
+    found = READERS[form](out)
+    for topic, place, odds in (("/map/grid", (2.0, 0.5), 5.2), ("/map/grid/floor_missing", (3.0, -1.0), 7.2)):
+        ((_, message),) = found[topic]
+        about = message.info
+        row, column = divmod(int(message.data.argmax()), about.width)
+        centre = [about.origin.position.x, about.origin.position.y]
+        centre[0] += (column + 0.5) * about.resolution
+        centre[1] += (row + 0.5) * about.resolution
+        assert centre == pytest.approx([place[0] + 0.05, place[1] + 0.05])
+        assert message.data.max() == round(100 / (1 + math.exp(-odds)))
+    table = found["/map/grid"][0][1].data.reshape(80, 60)
+    assert (table[0, 0], table[20, 20]) == (-1, round(100 / (1 + math.exp(2.8)))), "unknown, free"
+    if form == "foxglove":
+        ((_, message),) = found["/map/grid/foxglove"]
+        cell = message.data.index(180)
+        row, rest = divmod(cell, message.row_stride)
+        column, field = divmod(rest, message.cell_stride)
+        assert message.fields[field].name == "0.50 m and up"
+        corner = message.pose.position
+        place = (corner.x + column * message.cell_size.x, corner.y + row * message.cell_size.y)
+        assert place == pytest.approx((2.0, 0.5))
 
 
 def test_frames_can_be_named(caneflow: Callable[..., Run], recording: Path, tmp_path: Path) -> None:

@@ -104,6 +104,8 @@ def _show(began: Began, events: Iterator[Event], settings: "Ros2Settings") -> No
     kinds = {edge.writer: SAMPLES.get(edge.schema) for edge in began.status.edges}
     with Ros2Bridge(settings, began.flow, read_rig(began.status.rig), kinds, waits=began.status.replay) as bridge:
         print(f"{began.flow} is in ROS 2 by {bridge.where}, domain {settings.domain} (Ctrl-C ends it)", flush=True)
+        if bridge.left_out:
+            print(f"left out {', '.join(bridge.left_out)}: ROS has no message for it", flush=True)
         for event in events:
             match event:
                 case Came():
@@ -188,7 +190,6 @@ class Ros2Bridge:
         self._node = Participant(settings.domain, self._neighbour.identity, settings.namespace, f"caneflow_{flow}")
         self._count = 0  # of publishers
         self._streams: dict[str, list[tuple[_Topic, Make]]] = {}
-        self._refused = 0
         try:
             self._neighbour.token(self._node.token())
             self._topic(self._messages.static_topic, TF_TYPE).send(self._messages.static(time.time_ns()))
@@ -202,6 +203,11 @@ class Ros2Bridge:
         if tf == "":
             poses = [stream for stream, kind in kinds.items() if kind is Pose]
             log.warning("nothing fills /tf: several streams hold poses (%s); choose one with tf", ", ".join(poses))
+
+    @property
+    def left_out(self) -> list[str]:
+        """The streams so far that ROS has no message for."""
+        return [stream for stream, topics in self._streams.items() if not topics]
 
     def take(self, node: str, port: str, kind: type[Sample] | None, decoded: Callable[[], Sample]) -> None:
         """Publish what a sample becomes, on the topics that somebody listens to; only then is it decoded."""
@@ -257,6 +263,8 @@ class Ros2(Sink):
         self._bridge = self._open.enter_context(Ros2Bridge(settings, flow, context.rig, kinds, waits=context.replay))
         self._open.enter_context(telling(flow, self._bridge.tell_status))
         log.info("%s is in ROS 2 by %s, domain %d", flow, self._bridge.where, settings.domain)
+        if self._bridge.left_out:
+            log.info("left out %s: ROS has no message for it", ", ".join(self._bridge.left_out))
 
     def take(self, key: str, message: Sample, payload: bytes, time: int) -> None:
         """Publish what one sample becomes."""

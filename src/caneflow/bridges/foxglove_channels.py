@@ -3,7 +3,7 @@
 Each topic of `RosMessages` is a channel of CDR with `ros2msg`, which Foxglove, Lichtblick, PlotJuggler and Rerun all
 read. What ROS has no message for is beside a pose in protobuf: `foxglove.Odometry` on `<topic>/foxglove`, and the
 track so far, with the 2-sigma ellipse of its end, as `foxglove.SceneUpdate` on `<topic>/track`. Streams without a ROS
-message are JSON, without their arrays.
+message are JSON, without their long arrays.
 """
 
 import json
@@ -26,10 +26,11 @@ from caneflow.bridges.ros_messages import (
     place_covariance,
 )
 from caneflow.errors import not_installed
-from caneflow.messages import Pose, Sample, json_schema
+from caneflow.messages import Grid, Pose, Sample, json_schema
 from caneflow.messages.control import FlowStatus
 
 MISSING = not_installed("foxglove-sdk", "foxglove")
+MOST_ELEMENTS = 100  # of an array in JSON: the zones of a range sensor, the table of the nearest obstacles
 TRACK_PERIOD = 1_000_000_000  # ns between two tracks: each is sent whole
 TRACK_STEP = 0.05  # m between two points of a track
 MOST_POINTS = 20_000  # of a track: 1 km of points; then every other one goes, and the step is doubled
@@ -113,7 +114,11 @@ class FoxgloveChannels:
         if not pictures:
             return [self._numbers(f"/{node}/{port}", kind)]
         outputs = [Output(topic, self._cdr(topic, cdr), self._as_cdr(cdr, make)) for topic, cdr, make in pictures]
-        return outputs + (self._scenes(pictures[0].topic, node) if kind is Pose else [])
+        if kind is Pose:
+            outputs += self._scenes(pictures[0].topic, node)
+        if kind is Grid:
+            outputs.append(self._grids(pictures[0].topic))
+        return outputs
 
     def _cdr(self, topic: str, kind: str) -> Any:
         foxglove = sdk()
@@ -141,6 +146,13 @@ class FoxgloveChannels:
             self._protobuf(f"{topic}/track", messages.SceneUpdate, track.take),
         ]
 
+    def _grids(self, topic: str) -> Output:
+        """Of a grid: all its slices, which ROS has no message for."""
+        from foxglove import messages
+
+        world = self._ros.frames.world
+        return self._protobuf(f"{topic}/foxglove", messages.Grid, lambda grid: _grid(grid, world))
+
     def _protobuf(self, topic: str, kind: Any, encode: Callable[[Any], bytes | None]) -> Output:
         schema = kind.get_schema()
         channel = sdk().Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
@@ -163,13 +175,17 @@ def sdk() -> Any:
 
 
 def numbers_of(message: Sample) -> dict[str, Any]:
-    """The fields of `message` as JSON has them: arrays and infinite values are left out."""
+    """The fields of `message` as JSON has them: long arrays, complex ones and infinite values are left out."""
     values = {name: getattr(message, name) for name in message.__struct_fields__}
     return {
-        name: msgspec.to_builtins(value)
+        name: value.tolist() if isinstance(value, np.ndarray) else msgspec.to_builtins(value)
         for name, value in values.items()
-        if not (value is None or isinstance(value, np.ndarray) or (isinstance(value, float) and math.isinf(value)))
+        if not (value is None or _is_too_much(value) or (isinstance(value, float) and math.isinf(value)))
     }
+
+
+def _is_too_much(value: object) -> bool:
+    return isinstance(value, np.ndarray) and (value.size > MOST_ELEMENTS or value.dtype.kind == "c")
 
 
 def json_of(payload: bytes) -> bytes | None:
@@ -207,6 +223,31 @@ def _odometry(pose: Pose, world: str) -> bytes:
         linear_velocity=messages.Vector3(x=a, y=b, z=c),
         metadata=[messages.KeyValuePair(key=key, value=value) for key, value in said.items()],
         **covariances,
+    ).encode()
+
+
+def _grid(grid: Grid, world: str) -> bytes:
+    """`foxglove.Grid` with a field per slice, named by its heights: 128 + log-odds, as the sample has them."""
+    from foxglove import messages
+
+    slices, columns, _ = grid.occupancy.shape
+    heights = [f"{grid.bottom + index * grid.slice:.2f} m and up" for index in range(slices)]
+    numeric = messages.PackedElementFieldNumericType.Uint8
+    x, y = (float(grid.cell * index) for index in grid.origin)
+    return messages.Grid(
+        timestamp=messages.Timestamp(*divmod(grid.stamp, 10**9)),
+        frame_id=world,
+        pose=messages.Pose(
+            position=messages.Vector3(x=x, y=y, z=0.0), orientation=messages.Quaternion(x=0, y=0, z=0, w=1)
+        ),
+        column_count=columns,
+        cell_size=messages.Vector2(x=grid.cell, y=grid.cell),
+        row_stride=slices * columns,
+        cell_stride=slices,
+        fields=[
+            messages.PackedElementField(name=name, offset=index, type=numeric) for index, name in enumerate(heights)
+        ],
+        data=np.ascontiguousarray(grid.occupancy.transpose(2, 1, 0)).tobytes(),
     ).encode()
 
 

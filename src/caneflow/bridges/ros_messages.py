@@ -13,6 +13,8 @@ nobody hears costs nothing.
 | | /tf | tf2_msgs/TFMessage: world -> base_footprint -> base_link, of one stream |
 | GroundSpeed | .../twist | geometry_msgs/TwistWithCovarianceStamped in base_footprint |
 | RadarFrame | /radar/frame | sensor_msgs/Image: the range-Doppler map, ten a second |
+| Grid | /surroundings/grid | nav_msgs/OccupancyGrid: of each column of slices the one most likely occupied |
+| | .../floor_missing | nav_msgs/OccupancyGrid: where the floor is missing |
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,10 +26,11 @@ from caneflow.algorithms.rotations import Quaternion, Vector, conjugate, rotate
 from caneflow.bridges.frames import BASE, FOOTPRINT, IMU, RADAR, Frames, Transform, matrix_of
 from caneflow.bridges.radar_images import RadarImages
 from caneflow.bridges.ros_types import RosTypes
-from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample
+from caneflow.messages import Grid, GroundSpeed, Imu, Pose, RadarFrame, Sample
 from caneflow.messages.control import FlowStatus
 
 NOT_OBSERVED: Final = 1e6  # variance of what is not observed, as on our own wire
+UNKNOWN_CELL: Final = 128  # of a grid: log-odds of 0
 ABSENT: Final = -1.0  # the first element of a covariance, where the whole quantity is not there (sensor_msgs/Imu)
 TF, TF_STATIC, DIAGNOSTICS = "/tf", "/tf_static", "/diagnostics"
 TRUTH = "truth"  # the node of the ground truth
@@ -38,6 +41,7 @@ IMAGE_TYPE = "sensor_msgs/msg/Image"
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 POSE_COVARIANCE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+GRID_TYPE = "nav_msgs/msg/OccupancyGrid"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -70,6 +74,7 @@ class RosMessages:
             Pose: self._pose_pictures,
             GroundSpeed: self._speed_pictures,
             RadarFrame: self._frame_pictures,
+            Grid: self._grid_pictures,
         }
         self._build = _Builders(types)
 
@@ -116,6 +121,13 @@ class RosMessages:
     def _frame_pictures(self, node: str, port: str, topic: str) -> list[Picture]:
         images = RadarImages()
         return [Picture(topic, IMAGE_TYPE, lambda frame: self._build.image(frame, images))]
+
+    def _grid_pictures(self, node: str, port: str, topic: str) -> list[Picture]:
+        world, build = self.frames.world, self._build
+        return [
+            Picture(topic, GRID_TYPE, lambda grid: build.occupied(grid, world)),
+            Picture(f"{topic}/floor_missing", GRID_TYPE, lambda grid: build.floor_missing(grid, world)),
+        ]
 
 
 def tf_stream(streams: Mapping[str, type[Sample] | None], chosen: str | None = None) -> str | None:
@@ -220,6 +232,31 @@ class _Builders:
             step=width,
             data=image.grey.reshape(-1),
         )
+
+    def occupied(self, grid: Grid, world: str) -> Any:
+        known = grid.occupancy != UNKNOWN_CELL
+        highest = np.where(known, grid.occupancy, 0).max(axis=0)
+        return self._map(grid, np.where(known.any(axis=0), highest, UNKNOWN_CELL), world)
+
+    def floor_missing(self, grid: Grid, world: str) -> Any:
+        return None if grid.floor_missing is None else self._map(grid, grid.floor_missing, world)
+
+    def _map(self, grid: Grid, cells: Any, world: str) -> Any:
+        """Of `cells` (H, W), whose first index runs along x: ROS has rows along x, and its width is their length."""
+        odds = grid.unit * (cells.astype(float) - UNKNOWN_CELL)
+        percent = np.rint(100 / (1 + np.exp(-np.clip(odds, -50, 50)))).astype(np.int8)
+        percent[cells == UNKNOWN_CELL] = -1  # unknown, in ROS
+        header = self.header(grid.stamp, world)
+        x, y = (float(grid.cell * index) for index in grid.origin)
+        corner = self._pose(position=self._point(x=x, y=y, z=0.0), orientation=self.quaternion((1.0, 0.0, 0.0, 0.0)))
+        about = self._types["nav_msgs/msg/MapMetaData"](
+            map_load_time=header.stamp,
+            resolution=float(grid.cell),
+            width=cells.shape[0],
+            height=cells.shape[1],
+            origin=corner,
+        )
+        return self._types[GRID_TYPE](header=header, info=about, data=np.ascontiguousarray(percent.T).reshape(-1))
 
     def transforms(self, stamp: int, transforms: Sequence[Transform]) -> Any:
         return self._types[TF_TYPE](
