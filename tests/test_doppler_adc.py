@@ -299,7 +299,8 @@ def targets(path: Path) -> list[tuple[float, float, bool]]:
 
 
 def test_a_flow_hears_the_same_from_a_file_and_from_its_recording(tmp_path: Path) -> None:
-    tone = 10_000 * np.sin(2 * np.pi * 320 * np.arange(2 * RATE) / RATE) + noise(2 * RATE)[:, 0] / 100
+    times = np.arange(4 * RATE) / RATE  # s: two of an empty room, two of a target
+    tone = 10_000 * np.sin(2 * np.pi * 320 * times) * (times >= 2.0) + noise(4 * RATE)[:, 0] / 100
     path, flow = written(tmp_path / "sound.wav", tone.astype(np.int16)[:, None]), tmp_path / "flow.yaml"
     flow.write_text(FLOW.format(flow="t" + tmp_path.name.replace("_", "")[-30:], sound=path))
     imported(path, "-o", tmp_path / "in.mcap")

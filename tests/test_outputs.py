@@ -397,6 +397,9 @@ OUTPUTS: dict[tuple[str, str], list[object]] = {
     ("mcu config", "output"): ["mcu", "config", "YAML", "-o", "OUT"],
     ("new operator", "folder"): ["new", "operator", "out", "--folder", "FOLDER"],
     ("new driver", "folder"): ["new", "driver", "out", "--folder", "FOLDER"],
+    ("new message", "folder"): ["new", "message", "out", "--folder", "FOLDER"],
+    ("new flow", "output"): ["new", "flow", "cane", "-o", "OUT"],
+    ("import rosbag", "output"): ["import", "rosbag", "LOG", "-o", "OUT"],
 }
 MORE: dict[tuple[str, str], list[list[object]]] = {
     ("export", "output"): [
@@ -408,7 +411,7 @@ CALLS = [(named, call) for named, first in OUTPUTS.items() for call in (first, *
 # What only reads, keeps to rules of its own (keys, the results that go on, a link to a terminal), or is no user's file.
 OTHERS = {
     *(("run", name) for name in ("replay", "keys", "rig")),
-    *((word, "keys") for word in ("status", "hz", "echo", "top", "record", "doctor", "view")),
+    *((word, "keys") for word in ("status", "hz", "echo", "top", "record", "doctor", "view", "ros2", "foxglove")),
     *((f"keys {word}", "folder") for word in ("init", "add", "list", "router")),
     *((word, "flow") for word in ("eval", "experiments")),
     ("bench", "file"),
@@ -416,6 +419,8 @@ OTHERS = {
     ("eval", "results_file"),
     ("experiments", "folder"),
     ("emulate bno055", "port"),
+    ("emulate mb1202", "bus"),
+    ("import rosbag", "rig"),
 }
 
 

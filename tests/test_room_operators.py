@@ -80,7 +80,8 @@ def tracker(
 
 def block(index: int, frequency: float = -150.0, amplitude: float = 0.1) -> DopplerBlock:
     at = (np.arange(200) + 200 * index) / 4000.0
-    samples = amplitude * np.exp(2j * np.pi * frequency * at) + 1e-4 * np.random.default_rng(index).normal(size=200)
+    noise = 1e-4 * np.random.default_rng(index).normal(size=(2, 200))
+    samples = amplitude * np.exp(2j * np.pi * frequency * at) + noise[0] + 1j * noise[1]
     return DopplerBlock(
         stamp=START_NS + index * BLOCK_NS, samples=samples.astype(np.complex64), sample_rate=4000.0, carrier=24.125e9
     )
