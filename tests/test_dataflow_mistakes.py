@@ -300,7 +300,7 @@ ONE_MISTAKE = {
     "message that is none": (
         "run: drivers.bno055",
         "external: true, outputs: {imu: Immu}",
-        "3:40: nodes.imu.outputs.imu: no message 'Immu'; did you mean 'Imu'? there are Imu, GroundSpeed, ",
+        "3:40: nodes.imu.outputs.imu: no message 'Immu'; did you mean 'Imu'? there are Cue, DopplerBlock, ",
     ),
     "external with another message": (
         "run: drivers.bno055",

@@ -226,7 +226,7 @@ class _Listener:
         self.values: dict[str, Any] = {}  # parameters by name
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        self._channels.say_again(channel.id, client.id)
+        self._channels.say_again(channel.id)
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
         """The channels ask who is there."""

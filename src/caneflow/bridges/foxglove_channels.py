@@ -103,11 +103,14 @@ class FoxgloveChannels:
             message = self._ros.diagnostics(status, stamp)
             self._diagnostics.log(self._ros.types.encoded(DIAGNOSTICS_TYPE, message), log_time=stamp)
 
-    def say_again(self, channel: int, client: int) -> None:
-        """Send the last message of a channel that lasts to one client, which came after it."""
+    def say_again(self, channel: int) -> None:
+        """Send the last message of a channel that lasts once more, for a client that came after it.
+
+        To all that listen: the server's clients are numbered apart from what a channel can be told to write to.
+        """
         if channel in self._last:
             data, stamp = self._last[channel]
-            self._static.log(data, log_time=stamp, sink_id=client)
+            self._static.log(data, log_time=stamp)
 
     def _outputs(self, node: str, port: str, kind: type[Sample]) -> list[Output]:
         pictures = self._ros.pictures(node, port, kind)

@@ -26,7 +26,7 @@ def message_named(written: str, base: Path) -> type[Sample]:
         if len(found) > 1:
             raise DataflowError(f"{shown(written)} can be {listed(kind.schema for kind in found)}; name one of these")
         if not found:
-            names = _names(SAMPLES.values())
+            names = sorted(_names(SAMPLES.values()))  # the registry's order is that of imports
             raise DataflowError(
                 f"no message {shown(written)};{did_you_mean(written, names)} there are {listed(names)}; {OWN}"
             )

@@ -17,6 +17,7 @@ from caneflow.runtime.hosts.links.session import open_session
 
 LEASE = 10_000  # ms, Zenoh's own default: the other side is not ours, and may be slow
 SETTLING = 1.0  # s that a new publisher sends everything: who hears it is told a moment later
+POLL = 0.01  # s between two looks at who hears it
 LOOPBACK = ("tcp/127.", "tcp/localhost:", "tcp/[::1]:", "udp/127.", "unixsock-stream/")
 
 
@@ -31,9 +32,11 @@ class Foreign(NamedTuple):
 class Outlet:
     """One key that is published, and whether anybody hears it."""
 
-    def __init__(self, publisher: Any, *, watched: bool) -> None:
+    def __init__(self, publisher: Any, *, watched: bool, patient: bool) -> None:
+        """`watched`: it can tell who hears it. `patient`: in its first second it waits until somebody does."""
         self._publisher = publisher
         self._watched = watched
+        self._patient = patient
         self._settled_at = time.monotonic() + SETTLING
 
     @property
@@ -41,7 +44,13 @@ class Outlet:
         """Whether somebody listens, as far as this session knows; in its first second: yes."""
         if not self._watched:
             return True
-        return bool(self._publisher.matching_status.matching) or time.monotonic() < self._settled_at
+        while not self._publisher.matching_status.matching:
+            if time.monotonic() >= self._settled_at:
+                return False
+            if not self._patient:
+                return True
+            time.sleep(POLL)  # what is sent now would reach nobody, not even those that listen already
+        return True
 
     def put(self, payload: bytes, attachment: bytes) -> None:
         """Send one message."""
@@ -64,6 +73,7 @@ class Neighbour:
         more = {"transport/link/tx/lease": LEASE, "timestamping/enabled": True}  # stamps: for what is kept
         self._session = open_session(**where, replay=waits, more=more)
         self._control = zenoh.CongestionControl.BLOCK if waits else zenoh.CongestionControl.DROP
+        self._waits = waits
         self._held: list[Any] = []  # tokens, publishers and subscribers
         self._lock = threading.Lock()
         self.identity = str(self._session.info.zid())
@@ -82,7 +92,7 @@ class Neighbour:
         else:
             publisher = self._session.declare_publisher(key, congestion_control=self._control)
         self._hold(publisher)
-        return Outlet(publisher, watched=not kept)
+        return Outlet(publisher, watched=not kept, patient=self._waits)
 
     def hear(self, key: str, take: Callable[[Foreign], None], *, kept: bool = False) -> None:
         """Hand what comes on `key` to `take`, on a thread of Zenoh's: it must not wait.
