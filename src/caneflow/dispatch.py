@@ -60,9 +60,8 @@ def restart_with_pinned_mathematics() -> None:
 
     The process stays the same, its interpreter is a new one: to be called before anything else is done.
     """
-    restarted = (
-        os.environ.pop(RESTARTED, None) is not None
-    )  # and to no avail: glibc hides tunables from privileged ones
+    # Restarted already, and to no avail: glibc hides tunables from privileged programs.
+    restarted = os.environ.pop(RESTARTED, None) is not None
     begun_with = _tunables_at_start()
     if restarted or not _has_fused_mathematics() or begun_with is None or _pinned_tunables(begun_with) == begun_with:
         return
