@@ -137,7 +137,7 @@ def room(rng: Generator) -> ObstacleCourse:
         for side in (-1, 1)
     ]
     walls.append(Solid((21.5, 22.0, -half, half, CELLAR, CEILING), 0.6))
-    things, way, x = [], [(0.0, 0.0), (2.5, 0.0)], 4.5
+    things = []
     for kind in _shuffled(["table", "person", "glass", "black"], rng):
         offset = float(rng.uniform(-0.2, 0.2))
         if kind == "glass":
@@ -146,12 +146,8 @@ def room(rng: Generator) -> ObstacleCourse:
             thing = _plain("black", (LOW, WAIST), (0.4, 0.5, 1.1), 0.0, BLACK, offset)
         else:
             thing = THINGS[kind](rng, offset)
-        thing = thing.moved(x)
-        aside = _past(thing)
-        way += [(x - 0.5, aside), (x + 0.7, aside)]
         things.append(thing)
-        x += 3.6
-    way.append((x, 0.0))
+    things, way = _in_a_row(things)
     return ObstacleCourse(
         kind="room",
         course=course_through(_smooth(way)),
@@ -166,7 +162,7 @@ def street(rng: Generator) -> ObstacleCourse:
     """A pavement in sunlight: a house on one side, a kerb down on the other, lamp posts, a branch, a person coming."""
     house = Solid((-3.0, 25.0, 1.4, 1.8, CELLAR, 6.0), float(rng.uniform(0.3, 0.6)))
     road = Solid((-3.0, 25.0, -6.0, -1.2, -0.3, -0.13), float(rng.uniform(0.1, 0.2)))
-    things, way, x = [], [(0.0, 0.0), (2.5, 0.0)], 4.5
+    things = []
     for kind in _shuffled(["pole", "branch", "person", "box"], rng):
         offset = float(rng.uniform(-0.2, 0.2))
         if kind == "branch":
@@ -177,12 +173,8 @@ def street(rng: Generator) -> ObstacleCourse:
             thing = Thing(kind="branch", levels=(HEAD,), box=(0.0, 0.33, -0.45, 0.45), z=(1.5, 1.98), parts=parts)
         else:
             thing = THINGS[kind](rng, offset)
-        thing = thing.moved(x)
-        aside = _past(thing)
-        way += [(x - 0.5, aside), (x + 0.7, aside)]
         things.append(thing)
-        x += 3.6
-    way.append((x, 0.0))
+    things, way = _in_a_row(things)
     return ObstacleCourse(
         kind="street",
         course=course_through(_smooth(way)),
@@ -316,6 +308,17 @@ def _past(thing: Thing) -> float:
     left, right = thing.box[3] + CLEARANCE, thing.box[2] - CLEARANCE
     aside = left if abs(left) <= abs(right) else right
     return float(np.clip(aside, 0.3 - CORRIDOR + 0.1, CORRIDOR - 0.3 - 0.1))
+
+
+def _in_a_row(things: Sequence[Thing]) -> tuple[list[Thing], list[tuple[float, float]]]:
+    """The things one after another, every 3.6 m from 4.5 m on, and a way (x, y in m) that passes each of them."""
+    placed, way, x = [], [(0.0, 0.0), (2.5, 0.0)], 4.5
+    for thing in things:
+        placed.append(thing.moved(x))
+        aside = _past(placed[-1])
+        way += [(x - 0.5, aside), (x + 0.7, aside)]
+        x += 3.6
+    return placed, [*way, (x, 0.0)]
 
 
 def _shuffled(kinds: list[str], rng: Generator) -> list[str]:
