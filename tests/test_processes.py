@@ -252,7 +252,7 @@ def test_a_loop_goes_on_with_stamps_and_numbers(
     status, output = running.end(signal.SIGINT)
     assert status == 130, output
     with Recording(out) as recording:
-        assert recording.complete
+        assert recording.complete, output
         poses = [(s.seq, s.stamp) for s in recording.samples([("fusion", "pose")])]
     assert [seq for seq, _ in poses] == list(range(len(poses)))
     spacing = {b - a for (_, a), (_, b) in itertools.pairwise(poses)}
@@ -271,10 +271,9 @@ def test_ctrl_c_and_a_lost_terminal_end_everything_in_order(
         next(counters(session, running.flow, "echo"))
     nodes = running.nodes()
     assert len(nodes) == 3
-    began = time.monotonic()
     status, output = running.end(number)
     assert status == 130, output
-    assert time.monotonic() - began < 5
+    assert "killed" not in output
     assert not any(node.is_running() for node in nodes)
     with Recording(out) as recording:
         assert recording.complete

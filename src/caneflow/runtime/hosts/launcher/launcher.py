@@ -41,6 +41,7 @@ from caneflow.runtime.outcome import Outcome, note_losses
 from caneflow.runtime.stages.merge import BEGIN
 
 STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them: 5 s in all
+RECORDER_PATIENCE = 10.0  # s that recorders have, behind all others: who kills one loses the end of its recording
 LEADER_PATIENCE = 120.0  # s that the part of a replay waits for its leader to come back
 WAITING_SAID = 10.0  # s after which a launcher says again whom it waits for
 PAGE = "the page"  # no node can be called so
@@ -321,13 +322,14 @@ class Launcher:
 
         Else a recorder may hear a sample that an operator, which ended sooner, has neither handled nor left out.
         """
-        sources, operators, sinks = self._nodes.kinds
+        sources, operators, sinks, recorders = self._nodes.kinds
         killed = self._processes.end(sources, operators, patience=STOP_PATIENCE)
         killed += self._processes.end(sinks, patience=STOP_PATIENCE - 0.5)
         for name in killed:
             self._say(name, f"did not end within {STOP_PATIENCE:g} s; killed", "warning")
-            if self._nodes[name].spare:
-                self._outcome.unrecorded.append(f"{name}: the recording is incomplete: it was killed at the end")
+        for name in self._processes.end(recorders, patience=RECORDER_PATIENCE):
+            self._say(name, f"did not end within {RECORDER_PATIENCE:g} s; killed", "warning")
+            self._outcome.unrecorded.append(f"{name}: the recording is incomplete: it was killed at the end")
         while not self._events.empty():
             match self._events.get_nowait():
                 case Line(node, text):

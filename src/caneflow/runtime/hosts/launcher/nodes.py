@@ -102,17 +102,19 @@ class Nodes:
         return (node.handled for node in self if node.plan.inputs)
 
     @property
-    def kinds(self) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
-        """The processes here, by their first nodes: with sources alone, with operators, with sinks."""
-        sources, operators, sinks = [], [], []
+    def kinds(self) -> tuple[Sequence[str], Sequence[str], Sequence[str], Sequence[str]]:
+        """The processes here, by their first nodes: with sources alone, with operators, with sinks, with a recorder."""
+        sources, operators, sinks, recorders = [], [], [], []
         for head, members in self._processes.items():
-            if any(node.plan.inputs and not node.plan.outputs for node in members):
+            if any(node.plan.module == RECORDER_MODULE for node in members):
+                recorders.append(head)
+            elif any(node.plan.inputs and not node.plan.outputs for node in members):
                 sinks.append(head)
             elif any(node.plan.inputs for node in members):
                 operators.append(head)
             else:
                 sources.append(head)
-        return sources, operators, sinks
+        return sources, operators, sinks, recorders
 
     @property
     def unrecorded(self) -> list[str]:

@@ -29,7 +29,7 @@ from caneflow.runtime.hosts.process.events import (
     weight_of_event,
 )
 from caneflow.runtime.hosts.process.inbox import Inbox
-from caneflow.runtime.hosts.process.lanes import Lane
+from caneflow.runtime.hosts.process.lanes import HEARING_OUT, Lane
 from caneflow.runtime.plan import NodePlan, ProcessPlan
 from caneflow.runtime.stages.byte_budget import CONTROL, INBOX, share
 
@@ -112,6 +112,9 @@ class Bus:
             subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
         for lane in self._lanes.values():
             lane.end()
+        until = time.monotonic() + HEARING_OUT
+        for lane in self._lanes.values():
+            lane.wait_for_end(until)
         self._subscribers.clear()
 
     def put(self, event: Event) -> None:

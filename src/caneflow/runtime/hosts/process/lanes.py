@@ -1,12 +1,13 @@
 """In a replay, all that comes for one input port, in order, on a thread of its own, which may block."""
 
 import threading
+import time
 from collections.abc import Callable
 
 from caneflow.runtime.hosts.process.events import Event, Stopped
 from caneflow.runtime.hosts.process.inbox import Inbox
 
-HEARING_OUT = 1.0  # s, at most, for what has come when a node is to end
+HEARING_OUT = 1.0  # s, at most and for all lanes, for what has come when a node is to end
 
 
 class Lane:
@@ -26,7 +27,10 @@ class Lane:
     def end(self) -> None:
         """Bring what has come, and no more."""
         self._inbox.put(Stopped())
-        self._thread.join(HEARING_OUT)
+
+    def wait_for_end(self, until: float) -> None:
+        """Wait for that, up to `until` (s, monotonic)."""
+        self._thread.join(max(0.0, until - time.monotonic()))
 
     @property
     def held(self) -> int:
