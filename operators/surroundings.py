@@ -279,22 +279,20 @@ class Surroundings(Operator):
             )
 
     def _obstacles(self, stamp: int) -> Obstacles:
-        nearest, closing = np.zeros((3, 4), np.float32), np.zeros((3, 4), np.float32)
-        place = np.zeros((3, 4, 2), np.float32)
-        for sector, entries in enumerate(self._nearest.entries):
-            for level, entry in enumerate(entries):
-                if entry.found is not None:
-                    nearest[sector, level] = entry.found.distance
-                    closing[sector, level] = entry.closing()
-                    place[sector, level] = entry.found.x, entry.found.y
+        nearest = [[each.found.distance if each.found else 0.0 for each in sector] for sector in self._nearest.entries]
+        closing = [[each.closing() for each in sector] for sector in self._nearest.entries]
+        place = [
+            [(each.found.x, each.found.y) if each.found else (0.0, 0.0) for each in sector]
+            for sector in self._nearest.entries
+        ]
         return Obstacles(
             stamp=stamp,
             heading=self._direction.heading,
             walking=self._direction.walking,
-            nearest=nearest,
+            nearest=np.array(nearest, np.float32),
             known=self._nearest.known.astype(np.float32),
-            closing=closing,
-            place=place,
+            closing=np.array(closing, np.float32),
+            place=np.array(place, np.float32),
         )
 
     def _cue(self, stamp: int, reason: str, since_ns: int) -> Iterator[tuple[str, Sample]]:

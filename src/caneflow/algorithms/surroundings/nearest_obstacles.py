@@ -1,6 +1,5 @@
 """The nearest of each sector and level in the grid, told of after a second look and held over a few without."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Final, NamedTuple, TypeAlias
 
@@ -9,7 +8,7 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from caneflow.algorithms.quantities import Length, Zero
-from caneflow.algorithms.surroundings.occupancy_grid import CELL, LEAST, MOST, SLICE, OccupancyGrid
+from caneflow.algorithms.surroundings.occupancy_grid import CELL, CELLS, LEAST, MOST, SLICE, OccupancyGrid
 
 LEFT, AHEAD, RIGHT = 0, 1, 2
 LOW, WAIST, HEAD, DROP = 0, 1, 2, 3
@@ -94,12 +93,15 @@ class Entry:
         """Speed (m/s) at which it comes nearer, the slope of a straight line through the last moment; 0: unknown."""
         if len(self.history) < 4 or self.history[-1][0] - self.history[0][0] < CLOSING_NS // 2:
             return 0.0
-        end = self.history[-1][0]
-        times = [(stamp - end) * 1e-9 for stamp, _ in self.history]
-        middle = sum(times) / len(times)
-        mean = sum(distance for _, distance in self.history) / len(times)
-        above = sum((t - middle) * (d - mean) for t, (_, d) in zip(times, self.history, strict=True))
-        return -above / sum((t - middle) ** 2 for t in times)
+        end, count = self.history[-1][0], len(self.history)
+        sum_t = sum_d = sum_tt = sum_td = 0.0
+        for stamp, distance in self.history:
+            time = (stamp - end) * 1e-9
+            sum_t += time
+            sum_d += distance
+            sum_tt += time * time
+            sum_td += time * distance
+        return -(count * sum_td - sum_t * sum_d) / (count * sum_tt - sum_t * sum_t)
 
 
 CLOSING_NS: Final = 800_000_000  # ns of distances of which a closing speed is made
@@ -123,66 +125,80 @@ class NearestObstacles:
     def update(self, stamp_ns: int, middle_ns: int, grid: OccupancyGrid, view: View) -> None:
         """Look at the grid once; `middle_ns` is the middle of the exposure of the reading that asks."""
         settings = self._settings
-        x = (grid.world_lines(0) + 0.5) * CELL - view.x
-        y = (grid.world_lines(1) + 0.5) * CELL - view.y
-        ahead = np.add.outer(view.cos * x, view.sin * y).reshape(-1)
-        aside = np.add.outer(-view.sin * x, view.cos * y).reshape(-1)
-        weights, known = self._weights(grid), _known(grid, self._slices)
+        x = (grid.world_lines(0).astype(np.float64) + 0.5) * CELL - view.x
+        y = (grid.world_lines(1).astype(np.float64) + 0.5) * CELL - view.y
+        cells, ahead, aside = self._cells_in_sectors(x, y, view)
+        weights, known = self._levels(grid, cells)
+        sectors = self._sectors(ahead, aside)
+        share = sectors.astype(np.float64) @ known.T.astype(np.float64)  # whole numbers: exact in any order
+        self.known = share / np.maximum(np.count_nonzero(sectors, axis=1), 1)[:, None]
+        sectors[AHEAD] &= np.abs(aside) <= self._half - settings.edge
+        here = (weights * sectors[:, None, :]).reshape(12, -1)  # a row for each level of each sector
         needed = np.array([2 * settings.support] * 3 + [settings.support_drop])
-        for sector, unordered in enumerate(self._sectors(ahead, aside)):
-            cells = unordered[np.argsort(ahead[unordered], kind="stable")]
-            self.known[sector] = np.count_nonzero(known[:, cells], axis=1) / max(len(cells), 1)
-            here = weights[:, cells]
-            if sector == AHEAD:
-                here[:, np.abs(aside[cells]) > self._half - settings.edge] = 0
-            chosen = _nearest(ahead[cells], here, needed, settings.depth)
-            for level, first in enumerate(chosen):
-                found = None
-                if first >= 0:
-                    at = int(cells[first])
-                    row, column = divmod(at, len(x))
-                    found = Found(float(ahead[at]), float(aside[at]), float(x[row]) + view.x, float(y[column]) + view.y)
-                self.entries[sector][level].update(stamp_ns, middle_ns, found, settings)
+        chosen = _nearest(ahead, here, np.tile(needed, 3), settings.depth)
+        for number, first in enumerate(chosen):
+            found = None
+            if first >= 0:
+                i, j = divmod(int(cells[first]), CELLS)
+                found = Found(float(ahead[first]), float(aside[first]), float(x[i]) + view.x, float(y[j]) + view.y)
+            self.entries[number // 4][number % 4].update(stamp_ns, middle_ns, found, settings)
 
-    def _sectors(self, ahead: Table, aside: Table) -> Iterator[NDArray[np.intp]]:
-        """The cells of each sector, left, ahead, right, by their places in the user's frame."""
+    def _cells_in_sectors(self, x: Table, y: Table, view: View) -> tuple[NDArray[np.intp], Table, Table]:
+        """Cells that any sector can have, the nearest ahead first, and where they are ahead and to the left, m."""
         settings = self._settings
+        ahead = np.add.outer(view.cos * x, view.sin * y).reshape(-1)
         cells = np.flatnonzero((ahead >= settings.nearest) & (ahead <= max(settings.ahead, settings.beside)))
-        ahead, aside = ahead[cells], aside[cells]
-        near, outer = ahead <= settings.beside, np.abs(aside) <= settings.aside
-        yield cells[near & outer & (aside > self._half)]
-        yield cells[(ahead <= settings.ahead) & (np.abs(aside) <= self._half)]
-        yield cells[near & outer & (aside < -self._half)]
+        aside = np.add.outer(-view.sin * x, view.cos * y).reshape(-1).take(cells)
+        near = np.abs(aside) <= max(settings.aside, self._half)
+        cells, aside = cells[near], aside[near]
+        order = ahead.take(cells).argsort(kind="stable")
+        cells = cells.take(order)
+        return cells, ahead.take(cells), aside.take(order)
 
-    def _weights(self, grid: OccupancyGrid) -> NDArray[np.uint8]:
-        """How much stands in each cell at each level, (4, cells): two for an occupied slice, one for a likely one."""
+    def _sectors(self, ahead: Table, aside: Table) -> NDArray[np.bool_]:
+        """Whether each cell belongs to each sector, (3, cells): left, ahead, right."""
         settings = self._settings
-        occupied = (grid.occupancy >= settings.occupied).view(np.uint8)
-        likely = (grid.occupancy >= settings.likely).view(np.uint8)
-        weights = (occupied + likely).reshape(grid.slices, -1)
-        missing = (grid.floor_missing >= settings.missing).view(np.uint8).reshape(-1)
+        beside = (ahead <= settings.beside) & (np.abs(aside) <= settings.aside)
         return np.stack(
-            [*(np.add.reduce(weights[first:last], dtype=np.uint8) for first, last in self._slices), missing]
+            [
+                beside & (aside > self._half),
+                (ahead <= settings.ahead) & (np.abs(aside) <= self._half),
+                beside & (aside < -self._half),
+            ]
         )
 
+    def _levels(self, grid: OccupancyGrid, cells: NDArray[np.intp]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """How much stands in each cell at each level, and whether anything is known of it there: both (4, cells).
 
-def _known(grid: OccupancyGrid, slices: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
-    """Whether anything is known of each cell at each level, (4, cells)."""
-    looked_at = (grid.occupancy != 0).reshape(grid.slices, -1)
-    levels = [np.logical_or.reduce(looked_at[first:last]) for first, last in slices]
-    return np.stack([*levels, grid.floor_missing.reshape(-1) != 0])
+        An occupied slice weighs two, a likely one one; where the floor is missing it is one.
+        """
+        settings = self._settings
+        counts = grid.occupancy.reshape(grid.slices, -1).take(cells, axis=1)
+        floor = grid.floor_missing.reshape(-1).take(cells)
+        weights = (counts >= settings.occupied).view(np.uint8) + (counts >= settings.likely).view(np.uint8)
+        looked_at = counts != 0
+        standing = [np.add.reduce(weights[first:last], dtype=np.uint8) for first, last in self._slices]
+        known = [np.logical_or.reduce(looked_at[first:last]) for first, last in self._slices]
+        missing = (floor >= settings.missing).view(np.uint8)
+        return np.stack([*standing, missing]), np.stack([*known, floor != 0])
 
 
 def _nearest(ahead: Table, weights: NDArray[np.uint8], needed: NDArray[np.int64], depth: float) -> list[int]:
-    """By level the nearest cell from which on a weight of `needed` lies within `depth`, m; -1 when there is none.
+    """By row the nearest cell from which on a weight of `needed` lies within `depth`, m; -1 when there is none.
 
-    `ahead` (n,) m, in order; `weights` (levels, n).
+    `ahead` (n,) m, in order; `weights` (rows, n), `needed` (rows,).
     """
-    if not weights.any():
-        return [-1] * len(weights)
-    upto = np.zeros((len(weights), len(ahead) + 1), np.int64)
-    np.cumsum(weights, axis=1, out=upto[:, 1:])
-    gathered = upto[:, np.searchsorted(ahead, ahead + depth, side="right")] - upto[:, :-1]
-    enough = (gathered >= needed[:, None]) & (weights > 0)
-    first = np.where(enough.any(axis=1), enough.argmax(axis=1), -1)
-    return [int(each) for each in first]
+    chosen = [-1] * len(weights)
+    rows = np.flatnonzero(weights.any(axis=1))
+    if not len(rows):
+        return chosen
+    weights = weights.take(rows, axis=0)
+    upto = np.zeros((len(rows), len(ahead) + 1), np.int32)
+    np.cumsum(weights, axis=1, dtype=np.int32, out=upto[:, 1:])
+    gathered = upto.take(np.searchsorted(ahead, ahead + depth, side="right"), axis=1) - upto[:, :-1]
+    enough = (gathered >= needed[rows, None]) & (weights > 0)
+    for place, row in enumerate(rows.tolist()):
+        first = int(enough[place].argmax())
+        if enough[place, first]:
+            chosen[row] = first
+    return chosen

@@ -28,7 +28,6 @@ RANGE: Final = 4096  # of a metre, along a ray
 STEP: Final = RANGE // 16  # along a ray, between the points that are looked at
 STEPS: Final = 64  # of them: 4 m
 _MASK: Final = CELLS - 1
-_AT: Final = (np.arange(1, STEPS + 1, dtype=np.int32) * STEP)[None, :]  # where the points are, in 1/4096 m
 TWO_PERCENT: Final = 1311  # of 65536
 
 NOTHING, TARGET, NO_TARGET = 0, 1, 2  # what a ray says
@@ -116,76 +115,89 @@ class OccupancyGrid:
 
     def take(self, rays: Rays) -> NDArray[np.bool_]:
         """Add one reading; which of its rays (Z,) hit the floor. Each cell changes once, and a hit beats a miss."""
-        target = rays.says == TARGET
         slack = (rays.ranges * TWO_PERCENT) >> 16  # 1/4096 m
-        free_end = np.where(target, rays.ranges - FREE_MARGIN - slack, 0)
-        free_end[rays.says == NO_TARGET] = FREE_WITHOUT_TARGET
-        # Points that nothing is said of are not looked at.
-        farthest = max(int(rays.ranges[target].max(initial=0)), FREE_WITHOUT_TARGET, rays.floor_reach)
-        points = _points(rays, self.origin, min(farthest // STEP + 1, STEPS))
-        ends = _ends(rays, self.origin)
+        ends = _placed(rays, rays.directions.T * rays.ranges, self.origin)
         band = FLOOR_BAND + (slack << 4)
+        target = rays.says == TARGET
         floor: NDArray[np.bool_] = target & (np.abs(ends.height) <= band)
-        self._take_occupied(points, ends, free_end, floor, target & (ends.height > band))
-        self._take_missing_floor(rays, points, ends, floor, -BELOW - (band >> 1))
+        self._take_occupied(rays, ends, slack, floor, target & (ends.height > band))
+        self._take_missing_floor(rays, ends, floor, -BELOW - (band >> 1))
         return floor
 
     def forget(self) -> None:
         """Let every count go towards 0 by a sixteenth of it, rounded up."""
         for cells in (self.occupancy, self.floor_missing):
-            cells[...] = _FORGOTTEN[cells.view(np.uint8)]
+            left = np.frombuffer(cells.tobytes().translate(_FORGOTTEN), np.int8)
+            cells[...] = left.reshape(cells.shape)
+
+    # A reading touches a few hundred of 36864 cells, so they are listed, some of them many times. Each new value is
+    # made of what was there before the reading: listed twice, a cell gets the same value twice.
 
     def _take_occupied(
-        self,
-        points: "_Points",
-        ends: "_Points",
-        free_end: Integers,
-        floor: NDArray[np.bool_],
-        above: NDArray[np.bool_],
+        self, rays: Rays, ends: "_Points", slack: Integers, floor: NDArray[np.bool_], above: NDArray[np.bool_]
     ) -> None:
-        nowhere = self.slices * PLANE  # one more cell, for all that is not to be changed
-        change = np.zeros(nowhere + 1, np.int8)
-        steps = points.cell.shape[1]
-        passed = (
-            points.inside & (free_end[:, None] >= _AT[:, :steps]) & (points.height.view(np.uint32) < self.slices << 14)
-        )
-        change[np.where(passed, ((points.height >> 14) << 12) | points.cell, nowhere)] = -self._settings.miss
-        change[ends.cell[floor & ends.inside]] = -self._settings.miss  # there the floor is bare
-        hit = np.flatnonzero(above & ends.inside & (ends.height < self.slices << 14))
-        change[((ends.height[hit] >> 14) << 12) | ends.cell[hit]] = self._settings.hit
-        _add(self.occupancy, change[:nowhere])
+        settings, occupancy, top = self._settings, self.occupancy.reshape(-1), self.slices << 14
+        free_end = np.where(rays.says == TARGET, rays.ranges - FREE_MARGIN - slack, 0)
+        free_end[rays.says == NO_TARGET] = FREE_WITHOUT_TARGET
+        passed = _points_up_to(rays, free_end, self.origin)[0]
+        inside = passed.inside & (passed.height.view(np.uint32) < top)  # a negative height is a large number there
+        bare = ends.cell[floor & ends.inside]  # of slice 0
+        missed = np.concatenate([(((passed.height >> 14) << 12) | passed.cell)[inside], bare]).astype(np.intp)
+        hit = (((ends.height >> 14) << 12) | ends.cell)[above & ends.inside & (ends.height < top)]
+        after_hit = np.minimum(occupancy[hit] + np.int8(settings.hit), _MOST)
+        occupancy[missed] = np.maximum(occupancy[missed] - np.int8(settings.miss), _LEAST)
+        occupancy[hit] = after_hit
 
-    def _take_missing_floor(
-        self, rays: Rays, points: "_Points", ends: "_Points", floor: NDArray[np.bool_], depth: Integers
-    ) -> None:
-        settings = self._settings
-        change = np.zeros(PLANE, np.int8)
-        target, silent = rays.says == TARGET, rays.says == NO_TARGET
-        # The first point at or below the floor: a ray that goes down has all later ones below it.
-        zones = np.flatnonzero((silent & (points.height[:, -1] <= 0)) | (target & (ends.height < 0) & ~floor))
-        if len(zones):
-            crossing = np.count_nonzero(points.height[zones] > 0, axis=1)
-            at = (crossing + 1) * STEP
-            crossing = np.minimum(crossing, points.cell.shape[1] - 1)
-            unanswered = silent[zones] | (rays.ranges[zones] > at + BEYOND_FLOOR)
-            chosen = unanswered & (at <= rays.floor_reach) & points.inside[zones, crossing]
-            change[points.cell[zones[chosen], crossing[chosen]]] = settings.no_floor
-        zones = np.flatnonzero(target & (ends.height < depth))
-        if len(zones):
-            reached = rays.ranges[zones, None] >= _AT[:, : points.cell.shape[1]]
-            below = points.inside[zones] & (points.height[zones] < depth[zones, None]) & reached
-            change[points.cell[zones][below]] = settings.below_floor
-            change[ends.cell[zones[ends.inside[zones]]]] = settings.below_floor
-        change[ends.cell[floor & ends.inside]] = -settings.floor_seen
-        _add(self.floor_missing, change)
+    def _take_missing_floor(self, rays: Rays, ends: "_Points", floor: NDArray[np.bool_], depth: Integers) -> None:
+        settings, missing = self._settings, self.floor_missing.reshape(-1)
+        absent, below = self._unanswered(rays, ends, floor), self._below_floor(rays, ends, depth)
+        seen = ends.cell[floor & ends.inside]
+        after_absent = np.minimum(missing[absent] + np.int8(settings.no_floor), _MOST)
+        after_below = np.minimum(missing[below] + np.int8(settings.below_floor), _MOST)
+        after_seen = np.maximum(missing[seen] - np.int8(settings.floor_seen), _LEAST)
+        missing[absent] = after_absent
+        missing[below] = after_below
+        missing[seen] = after_seen
+
+    def _unanswered(self, rays: Rays, ends: "_Points", floor: NDArray[np.bool_]) -> Integers:
+        """Cells where a ray reaches the floor within where it has been answering, and it does not answer."""
+        last = min(rays.floor_reach // STEP, STEPS)
+        if last == 0:
+            return _NO_CELLS
+        silent = rays.says == NO_TARGET
+        passed = (rays.says == TARGET) & (ends.height < 0) & ~floor
+        down, height = rays.directions[:, 2], rays.origin[2]
+        lowest = height + np.minimum((down * STEP) >> 10, (down * (last * STEP)) >> 10)
+        zones = np.flatnonzero((silent | passed) & (lowest <= 0))
+        if not len(zones):
+            return _NO_CELLS
+        few = _some(rays, zones)
+        # The first point at or below the floor: the least k for which height + (down k STEP >> 10) <= 0.
+        at = np.maximum(-((4 * height - 3) // np.minimum(few.directions[:, 2], -1)), 1) * STEP
+        points = _placed(few, few.directions.T * at, self.origin)
+        unanswered: Integers = points.cell[points.inside & (silent[zones] | (few.ranges > at + BEYOND_FLOOR))]
+        return unanswered
+
+    def _below_floor(self, rays: Rays, ends: "_Points", depth: Integers) -> Integers:
+        """Cells over which a ray goes on below the floor."""
+        zones = np.flatnonzero((rays.says == TARGET) & (ends.height < depth))
+        if not len(zones):
+            return _NO_CELLS
+        few = _some(rays, zones)
+        points, zone = _points_up_to(few, few.ranges, self.origin)
+        deep = points.inside & (points.height < depth[zones[zone]])
+        return np.concatenate([points.cell[deep], ends.cell[zones[ends.inside[zones]]]])
 
 
 class _Points(NamedTuple):
-    """Points on rays: one or many on each."""
+    """n points on rays."""
 
-    cell: Integers  # index into a plane of the torus
-    inside: NDArray[np.bool_]  # the window
-    height: Integers  # above the floor, 1/65536 m
+    cell: Integers  # (n,) index into a plane of the torus
+    inside: NDArray[np.bool_]  # (n,) the window
+    height: Integers  # (n,) above the floor, 1/65536 m
+
+
+_NO_CELLS: Final = np.zeros(0, np.int32)
 
 
 def cell_of(metres: float) -> int:
@@ -201,42 +213,40 @@ def entering_lines(old: int, new: int) -> NDArray[np.intp]:
     return np.arange(first, first + abs(new - old)) & _MASK
 
 
-def _points(rays: Rays, window: tuple[int, int], steps: int) -> _Points:
-    """The points at which each ray is looked at: (Z, steps)."""
-    return _placed(rays, (rays.directions[:, :, None] * _AT[:, :steps]) >> 10, window)
+def _some(rays: Rays, zones: NDArray[np.intp]) -> Rays:
+    return rays._replace(directions=rays.directions[zones], ranges=rays.ranges[zones], says=rays.says[zones])
 
 
-def _ends(rays: Rays, window: tuple[int, int]) -> _Points:
-    """The points that the ranges say: (Z,)."""
-    return _placed(rays, (rays.directions * rays.ranges[:, None]) >> 10, window)
+def _points_up_to(rays: Rays, ends: Integers, window: tuple[int, int]) -> tuple[_Points, NDArray[np.intp]]:
+    """The points at which each ray is looked at, up to `ends` (Z,) in 1/4096 m; and the ray of each point."""
+    counts = np.minimum(np.maximum(ends, 0) // STEP, STEPS)
+    zone = np.repeat(np.arange(len(counts)), counts)
+    before = (np.cumsum(counts, dtype=np.int32) - counts).take(zone)  # points of the rays before
+    at = (np.arange(1, len(zone) + 1, dtype=np.int32) - before) * STEP
+    return _placed(rays, np.ascontiguousarray(rays.directions.T).take(zone, axis=1) * at, window), zone
 
 
 def _placed(rays: Rays, moved: Integers, window: tuple[int, int]) -> _Points:
-    """Points `moved` (Z, 3, ...) from the origin of the rays, 1/65536 m, in the torus."""
-    row = (rays.origin[0] - (window[0] << 16) + moved[:, 0] * CELLS_PER_METRE) >> 16
-    column = (rays.origin[1] - (window[1] << 16) + moved[:, 1] * CELLS_PER_METRE) >> 16
-    inside = ((row | column) & ~_MASK) == 0  # a negative one has high bits
-    cell = (((row + (window[0] & _MASK)) & _MASK) << 6) | ((column + (window[1] & _MASK)) & _MASK)
-    return _Points(cell, inside, rays.origin[2] + moved[:, 2])
-
-
-def _add(cells: Cells, change: Cells) -> None:
-    """Add with saturation; within a byte, as MOST + LARGEST is 127."""
-    flat = cells.reshape(-1)
-    flat += change
-    np.maximum(flat, _LEAST, out=flat)
-    np.minimum(flat, _MOST, out=flat)
+    """Points in the torus, `moved` (3, n) from the origin of the rays as direction by range."""
+    moved >>= 10  # 1/65536 m
+    lines = moved[:2] * CELLS_PER_METRE  # row and column, at first in 1/65536 from the window's low corner
+    lines += np.array([[rays.origin[axis] - (window[axis] << 16)] for axis in (0, 1)], np.int32)
+    lines >>= 16
+    inside = ((lines[0] | lines[1]) & ~_MASK) == 0  # a negative one has high bits
+    lines += np.array([[window[axis] & _MASK] for axis in (0, 1)], np.int32)
+    lines &= _MASK
+    return _Points((lines[0] << 6) | lines[1], inside, moved[2] + rays.origin[2])
 
 
 def _coded(cells: Cells) -> NDArray[np.uint8]:
     return (cells.astype(np.int16) + 128).astype(np.uint8)
 
 
-def _forgotten() -> Cells:
+def _forgotten() -> bytes:
     """By count, as its byte, what is left of it after `forget`."""
     counts = np.arange(256, dtype=np.uint8).view(np.int8).astype(np.int16)
     left: Cells = (counts - np.sign(counts) * ((np.abs(counts) + 15) >> 4)).astype(np.int8)
-    return left
+    return left.tobytes()
 
 
 _FORGOTTEN: Final = _forgotten()
