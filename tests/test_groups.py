@@ -1,6 +1,7 @@
 """Several nodes in one process: the same bytes as in one each, exact after a kill, still nodes to the outside."""
 
 import signal
+import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.attached.attach import attached, statuses
 from caneflow.runtime.stages.journal import Brought, Journal
-from tests.flows import NODES, launchers, node_processes, results, wait_for, write_walk
+from tests.flows import CANEFLOW, NODES, launchers, node_processes, results, wait_for, write_walk
 
 DEVICE = """
 import itertools, time
@@ -120,6 +121,66 @@ def test_a_live_group_that_is_killed_goes_on_exactly_and_is_still_nodes(tmp_path
         total += message.gyro[0]
         assert (told.seq, told.stamp, told.gyro[0]) == (message.seq, message.stamp, total)
     assert len(brought) - 1 <= len(sums) <= len(brought)
+
+
+def test_a_group_with_the_recorder_ends_its_sources_before_an_operator_outside(tmp_path: Path) -> None:
+    (tmp_path / "device.py").write_text(DEVICE)
+    (tmp_path / "sum.py").write_text(SUM)
+    flow, out = tmp_path / "flow.yaml", tmp_path / "out.mcap"
+    flow.write_text(
+        "flow: apart\nnodes:\n"
+        "  device: {run: device.py, process: recorder}\n"
+        "  sum: {run: sum.py, inputs: {imu: device/imu}}\n"
+        "results: [sum/imu]\n"
+    )
+    with launchers() as launch:
+        launched = launch("run", flow, "--record", out, log=tmp_path / "log")
+        launched.wait_for("ready: 3 nodes")
+        with attached("apart") as there:
+            wait_for(lambda: recorded(*statuses(there.session, "apart")) > 50, "samples")
+        launched.process.send_signal(signal.SIGINT)
+        assert launched.ends() == 130, launched.said
+    with Recording(out) as recording:
+        streams = {name: [each.seq for each in recording.samples([(name, "imu")])] for name in ("device", "sum")}
+    assert len(streams["device"]) > 50
+    assert streams["sum"] == streams["device"], "what the device brought last was handled before the operator ended"
+
+
+def test_in_a_replay_the_process_of_the_recorder_is_never_started_again(tmp_path: Path) -> None:
+    walk, flow = (
+        write_walk(tmp_path / "walk.mcap", 1000),
+        grouped(tmp_path / "flow.yaml", dict.fromkeys(NODES, "recorder")),
+    )
+    with launchers() as launch:
+        launched = launch("run", flow, "--replay", walk, "--record", tmp_path / "out.mcap", log=tmp_path / "log")
+        launched.wait_for("ready: 5 nodes")
+        refused = caneflow("restart", "grouped", "fusion")
+        assert (refused.returncode, refused.stdout) == (2, "")
+        assert "the recording of a replay is its result" in refused.stderr
+        node_processes(launched.process.pid)["recorder"].kill()
+        assert launched.ends() == 1, launched.said
+        assert "killed by SIGKILL: not started again: the recording of a replay is its result" in launched.said
+
+
+def test_a_group_in_a_replay_that_is_asked_to_restart_computes_the_same_bytes(tmp_path: Path) -> None:
+    walk, flow = write_walk(tmp_path / "walk.mcap", 250), grouped(tmp_path / "flow.yaml", dict.fromkeys(NODES, "cane"))
+    alone, out = tmp_path / "alone.mcap", tmp_path / "out.mcap"
+    with launchers() as launch:
+        launched = launch("run", flow, "--replay", walk, "--in-process", "--record", alone, log=tmp_path / "log")
+        assert launched.ends() == 0, launched.said
+        launched = launch("run", flow, "--replay", walk, "--record", out, log=tmp_path / "log")
+        launched.wait_for("ready: 5 nodes")
+        before = node_processes(launched.process.pid)
+        assert "grouped: fusion is ready again" in caneflow("restart", "grouped", "fusion").stdout
+        after = node_processes(launched.process.pid)
+        assert launched.ends() == 0, launched.said
+    assert after.keys() == before.keys() == {"cane", "recorder"}
+    assert {name for name in before if after[name].pid != before[name].pid} == {"cane"}, "it restarts as one"
+    assert results(out) == results(alone)
+
+
+def caneflow(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*CANEFLOW, *arguments], capture_output=True, text=True, timeout=60, check=False)
 
 
 def recorded(status: FlowStatus) -> int:

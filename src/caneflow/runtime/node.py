@@ -12,9 +12,10 @@ from pathlib import Path
 from caneflow.runtime.building import build
 from caneflow.runtime.dataflow.programs import Located, program_at
 from caneflow.runtime.hosts.process.bus import Bus
-from caneflow.runtime.hosts.process.events import Stopped
+from caneflow.runtime.hosts.process.events import SourcesEnd, Stopped
 from caneflow.runtime.hosts.process.last_words import telling_failures
 from caneflow.runtime.hosts.process.process import Process
+from caneflow.runtime.hosts.process.source_threads import SOURCES_END
 from caneflow.runtime.hosts.process.sources import SourceProcess
 from caneflow.runtime.hosts.process.speaker import name_speakers
 from caneflow.runtime.plan import NodePlan, ProcessPlan
@@ -66,6 +67,8 @@ def _run(programs: Mapping[str, Program], process: ProcessPlan, snapshots: Path)
             host = SourceProcess(process, bus, first)
         else:
             signal.signal(signal.SIGTERM, lambda *_: bus.put(Stopped()))
+            if len(built) > 1:
+                signal.signal(SOURCES_END, lambda *_: bus.put(SourcesEnd()))
             host = Process(process, bus, built, snapshots)
         with telling_failures(at=host.at):
             host.run()

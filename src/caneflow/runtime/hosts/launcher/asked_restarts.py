@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from caneflow.runtime.deployment import RECORDER_MODULE
+from caneflow.runtime.hosts.launcher.ends import RECORDS
 from caneflow.runtime.hosts.launcher.node_state import NodeState
 from caneflow.runtime.hosts.launcher.nodes import Nodes
 from caneflow.runtime.hosts.launcher.processes import Exited
@@ -37,9 +37,9 @@ class AskedRestarts:
         self._waiting: dict[str, list[RestartAsked]] = {}  # by node, for its new process to be ready
         self._kill_at: dict[str, float] = {}  # s, monotonic: of nodes that are to end
 
-    def take(self, asked: RestartAsked, *, replay: bool) -> None:
+    def take(self, asked: RestartAsked) -> None:
         """Do what is asked, or say why not."""
-        if (refusal := self._refusal(asked.node, replay=replay)) is not None:
+        if (refusal := self._refusal(asked.node)) is not None:
             asked.answer(refusal)
             return
         node = self._nodes.head_of(asked.node)
@@ -86,7 +86,7 @@ class AskedRestarts:
         for asked in self._waiting.pop(name):
             asked.answer(answer)
 
-    def _refusal(self, name: str, *, replay: bool) -> Answer | None:
+    def _refusal(self, name: str) -> Answer | None:
         """Why a node cannot be started again; None: it can."""
         names = [node.plan.node for node in self._nodes]
         if name not in self._nodes:
@@ -96,6 +96,6 @@ class AskedRestarts:
             return Answer(error=f"{name} is somebody else's program: whoever started it starts it again")
         if not node.here:
             return Answer(elsewhere=True)
-        if replay and node.plan.module == RECORDER_MODULE:
-            return Answer(error=f"{name}: the recording of a replay is its result, and would begin anew in the middle")
+        if node.records:
+            return Answer(error=f"{name}: {RECORDS}")
         return None

@@ -13,12 +13,13 @@ from caneflow.runtime.hosts.launcher.watcher import Say
 from caneflow.runtime.outcome import Outcome
 
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)  # of a program by itself
-RECORDER_RESTART = Restart(  # of a replay: its recording is its result
+RECORDER_RESTART = Restart(  # in a replay, of whatever process a recorder is in: its recording is its result
     policy="never", max_restarts=0, window_s=0.0, delay_s=0.0, max_delay_s=0.0
 )
 LIVE_RECORDER_RESTART = Restart(  # where the position is worth more than its recording: without end
     policy="always", max_restarts=sys.maxsize, window_s=60.0, delay_s=0.25, max_delay_s=10.0
 )
+RECORDS = "not started again: the recording of a replay is its result, and would begin anew in the middle"
 FAILING_SAID = 60.0  # s after which the launcher says again that the flow goes on without its recorder
 
 
@@ -55,7 +56,8 @@ class Ends:
         if not isinstance(verdict, Again):
             node.state = "failed"
             tried = f" after {node.restarts} restarts" if node.restarts else ""
-            parts = (f"{name} {cause}{tried}", verdict.why, node.last_line)
+            why = verdict.why or (node.records and RECORDS) or ""
+            parts = (f"{name} {cause}{tried}", why, node.last_line)
             self._outcome.failures.append(": ".join(filter(None, parts)))
             return
         node.restarts += 1

@@ -34,14 +34,13 @@ from caneflow.runtime.hosts.launcher.run_directory import RunDirectory, remove_s
 from caneflow.runtime.hosts.launcher.run_log import RunLog
 from caneflow.runtime.hosts.launcher.starting import plan_to_start, program_arguments
 from caneflow.runtime.hosts.launcher.stop_signals import Interrupted, stop_signals
+from caneflow.runtime.hosts.launcher.stopping import STOP_PATIENCE, Stopping
 from caneflow.runtime.hosts.launcher.watcher import Watcher
 from caneflow.runtime.hosts.links.access import opened
 from caneflow.runtime.hosts.links.session import local_links
 from caneflow.runtime.outcome import Outcome, note_losses
 from caneflow.runtime.stages.merge import BEGIN
 
-STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them: 5 s in all
-RECORDER_PATIENCE = 10.0  # s that recorders have, behind all others: who kills one loses the end of its recording
 LEADER_PATIENCE = 120.0  # s that the part of a replay waits for its leader to come back
 WAITING_SAID = 10.0  # s after which a launcher says again whom it waits for
 PAGE = "the page"  # no node can be called so
@@ -115,7 +114,8 @@ class Launcher:
                 self._follow()
             if self._companions is not None:
                 self._companions.part(self._session, deployment.flow, self._outcome)
-            self._stop()
+            stopping = Stopping(self._nodes, self._processes, self._events, self._say)
+            stopping.stop(self._outcome, begun=self._started_s is not None)
             self._let_others_leave()
             self._conclude()
         return self._outcome
@@ -206,7 +206,7 @@ class Launcher:
                     self._ends.exited(self._nodes[event.node], event, begun=self._started_s is not None)
                 self._begin_if_all_are_ready()
             case RestartAsked():
-                self._asked.take(event, replay=self._deployment.replay)
+                self._asked.take(event)
             case Interrupted():
                 self._outcome.interrupted = True
             case ForkServerLost():
@@ -316,26 +316,6 @@ class Launcher:
 
     def _all_ended(self) -> bool:
         return self._leads and self._nodes.all_ended
-
-    def _stop(self) -> None:
-        """End the sources, then the operators, then the sinks: each still takes what was on its way.
-
-        Else a recorder may hear a sample that an operator, which ended sooner, has neither handled nor left out.
-        """
-        sources, operators, sinks, recorders = self._nodes.kinds
-        killed = self._processes.end(sources, operators, patience=STOP_PATIENCE)
-        killed += self._processes.end(sinks, patience=STOP_PATIENCE - 0.5)
-        for name in killed:
-            self._say(name, f"did not end within {STOP_PATIENCE:g} s; killed", "warning")
-        for name in self._processes.end(recorders, patience=RECORDER_PATIENCE):
-            self._say(name, f"did not end within {RECORDER_PATIENCE:g} s; killed", "warning")
-            self._outcome.unrecorded.append(f"{name}: the recording is incomplete: it was killed at the end")
-        while not self._events.empty():
-            match self._events.get_nowait():
-                case Line(node, text):
-                    self._nodes.take_line(node, text)
-                case Said() as said:
-                    self._nodes.take_said(said)
 
     def _conclude(self) -> None:
         self._outcome.unrecorded += self._nodes.unrecorded

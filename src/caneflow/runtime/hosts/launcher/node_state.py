@@ -17,6 +17,7 @@ class NodeState:
     plan: NodePlan
     policy: Restarts
     spare: bool = False  # a live flow goes on without it: its recorder
+    records: bool = False  # a recorder of a replay runs in its process: the recording would begin anew in the middle
     here: bool = True  # False: another machine's launcher starts it
     state: str = "starting"  # starting, ready, ending (as asked), waiting (for its restart), failed; away: out of reach
     pid: int = 0

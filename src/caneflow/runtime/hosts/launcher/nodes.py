@@ -1,7 +1,7 @@
 """The nodes of a run as their launcher follows them: what they say, whether all are ready, whether all have ended."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 from caneflow.messages import MessageError, decode
 from caneflow.messages.control import Counters, FlowStatus, Progress
@@ -14,6 +14,7 @@ from caneflow.runtime.hosts.launcher.node_statistics import NodeStatistics
 from caneflow.runtime.hosts.launcher.restarts import Restarts
 from caneflow.runtime.hosts.launcher.watcher import Say
 from caneflow.runtime.hosts.process.speaker import spoken
+from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.stages.merge import END
 
 LAUNCHER = "caneflow"  # the launcher's name in the merged log
@@ -30,15 +31,18 @@ class Nodes:
 
     def take(self, deployment: Deployment, restarts: Mapping[str, Restart], *, leads: bool) -> None:
         """Know the nodes of `deployment`, each with its restart policy."""
+        plans = deployment.plans.values()
+        recording = {plan.runs_in for plan in plans if plan.module == RECORDER_MODULE and deployment.replay}
         for name, plan in deployment.plans.items():
             here = deployment.runs_here(name)
             if leads or here:
-                recorder = RECORDER_RESTART if deployment.replay else LIVE_RECORDER_RESTART
-                policy = Restarts(restarts.get(name, recorder), replay=deployment.replay)
-                alone = sum(other.runs_in == plan.runs_in for other in deployment.plans.values()) == 1
+                records = plan.runs_in in recording
+                restart = RECORDER_RESTART if records else restarts.get(name, LIVE_RECORDER_RESTART)
+                policy = Restarts(restart, replay=deployment.replay)
+                alone = sum(other.runs_in == plan.runs_in for other in plans) == 1
                 spare = plan.module == RECORDER_MODULE and not deployment.replay and alone
                 state = "external" if plan.external else "starting"
-                self._nodes[name] = NodeState(plan, policy, spare=spare, here=here, state=state)
+                self._nodes[name] = NodeState(plan, policy, spare=spare, records=records, here=here, state=state)
         first: dict[str, str] = {}
         for node in self.here:
             self._processes.setdefault(first.setdefault(node.plan.runs_in, node.plan.node), []).append(node)
@@ -102,19 +106,9 @@ class Nodes:
         return (node.handled for node in self if node.plan.inputs)
 
     @property
-    def kinds(self) -> tuple[Sequence[str], Sequence[str], Sequence[str], Sequence[str]]:
-        """The processes here, by their first nodes: with sources alone, with operators, with sinks, with a recorder."""
-        sources, operators, sinks, recorders = [], [], [], []
-        for head, members in self._processes.items():
-            if any(node.plan.module == RECORDER_MODULE for node in members):
-                recorders.append(head)
-            elif any(node.plan.inputs and not node.plan.outputs for node in members):
-                sinks.append(head)
-            elif any(node.plan.inputs for node in members):
-                operators.append(head)
-            else:
-                sources.append(head)
-        return sources, operators, sinks, recorders
+    def plans(self) -> dict[str, list[NodePlan]]:
+        """What each process here runs, by its first node."""
+        return {head: [node.plan for node in members] for head, members in self._processes.items()}
 
     @property
     def unrecorded(self) -> list[str]:

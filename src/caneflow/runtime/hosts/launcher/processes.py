@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from caneflow.runtime.hosts.launcher.fork_server import Ended, ForkServer, Started
+from caneflow.runtime.hosts.process.source_threads import SOURCES_END
 
 LINES_PATIENCE = 1.0  # s that the last lines of an ended node have to come: a child of it may hold the pipe open
 
@@ -102,6 +103,15 @@ class Processes:
         """Ask a node's process to end, and go on."""
         if node in self._running:
             _signal(self._running[node], signal.SIGTERM)
+
+    def ask_sources_to_end(self, node: str) -> bool:
+        """Ask a group's process to end its sources; whether there is one."""
+        process = self._running.get(node)
+        if process is None or process.ended.is_set():
+            return False
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process.pid, SOURCES_END)  # what it started itself is not asked
+        return True
 
     def kill(self, node: str) -> None:
         """End a node's process at once."""

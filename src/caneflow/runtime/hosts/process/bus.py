@@ -35,9 +35,7 @@ from caneflow.runtime.stages.byte_budget import CONTROL, INBOX, share
 
 log = logging.getLogger(__name__)
 
-Held: TypeAlias = (
-    "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.LivelinessToken | zenoh.MatchingListener[None]"
-)
+Held: TypeAlias = "zenoh.Subscriber[None] | zenoh.Queryable[None] | zenoh.MatchingListener[None]"
 
 ANSWER_TIMEOUT = 10.0  # s that a writer may take to send samples again
 TIMED_IN_REPLAY = 17  # one sample in so many says when it was sent; odd, so that streams in turn all come to it
@@ -63,6 +61,7 @@ class Bus:
         )
         # Whatever must outlive its statement: a liveliness token that no variable holds is undeclared at once.
         self._held: list[Held] = []
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}  # by node: it is ready
         self._subscribers: list[zenoh.Subscriber[Any]] = []  # of samples in a replay
         self._lanes: dict[tuple[str, str], Lane] = {}  # by node and input port, in a replay
         self._listen()
@@ -91,7 +90,8 @@ class Bus:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.hear_out()
-        for held in self._held:  # first, or Zenoh reports what still comes for a session that is closing
+        # First, or Zenoh reports what still comes for a session that is closing.
+        for held in (*self._tokens.values(), *self._held):
             held.undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
         self._session.close()  # type: ignore[no-untyped-call]  # the stub lacks its types
 
@@ -103,8 +103,14 @@ class Bus:
                     self._wait_for_reader(node, reader)
         for name in self._plan.members:
             key = control_key(self._plan.flow, "ready", name)
-            self._held.append(self._session.liveliness().declare_token(key))
+            self._tokens[name] = self._session.liveliness().declare_token(key)
         self.ready = True
+
+    def declare_gone(self, nodes: Iterable[str]) -> None:
+        """Tell the launcher that nothing more comes from some of the nodes."""
+        for node in nodes:
+            if node in self._tokens:
+                self._tokens.pop(node).undeclare()  # type: ignore[no-untyped-call]  # the stub lacks its types
 
     def hear_out(self) -> None:
         """End the threads that samples come on, once they have brought what has come."""

@@ -94,6 +94,14 @@ class Brought(msgspec.Struct, frozen=True, gc=False):
     sample: Sample | Encoded
 
 
+class SourcesEnd(msgspec.Struct, frozen=True, gc=False):
+    """The flow ends, and others have to end before this process: its sources end now."""
+
+
+class SourcesEnded(msgspec.Struct, frozen=True, gc=False):
+    """They have; what they brought last lies before this."""
+
+
 class Broken(msgspec.Struct, frozen=True, gc=False):
     """Something was raised while an event was taken at once: it belongs to the node's own thread."""
 
@@ -125,6 +133,8 @@ Event: TypeAlias = (
     | Marked
     | Timed
     | Brought
+    | SourcesEnd
+    | SourcesEnded
     | Broken
     | Started
     | Opened
@@ -138,7 +148,7 @@ def weight_of_event(event: Event) -> int:
     if kind is Arrived:
         return PER_SAMPLE + len(event.payload) + len(event.schema)  # type: ignore[union-attr]  # the kind says it
     match event:
-        case Started() | Stopped() | Broken() | AskEnded():
+        case Started() | Stopped() | SourcesEnd() | SourcesEnded() | Broken() | AskEnded():
             return 0
         case LeftOutNoted():
             return PER_SAMPLE + len(event.payload)

@@ -1,17 +1,19 @@
 """What the sources of a group bring: numbered, kept, sent, and handed to the members that read it."""
 
-from collections.abc import Callable, Iterable
+import threading
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Protocol
 
 from caneflow.messages import Sample, decode
 from caneflow.runtime.hosts.process.bus import Bus
-from caneflow.runtime.hosts.process.events import Brought
+from caneflow.runtime.hosts.process.events import Brought, Opened, SourcesEnd, SourcesEnded, Started
 from caneflow.runtime.hosts.process.group_recovery import AnyRecovery
 from caneflow.runtime.hosts.process.outputs import Outputs
 from caneflow.runtime.hosts.process.present import Present
+from caneflow.runtime.hosts.process.source_threads import SourceThreads
 from caneflow.runtime.plan import ProcessPlan
-from caneflow.runtime.program import Encoded
+from caneflow.runtime.program import Encoded, Source
 from caneflow.runtime.stages import journal
 from caneflow.runtime.stages.byte_budget import WAITING
 from caneflow.runtime.stages.group import Group
@@ -27,6 +29,7 @@ class Host(Protocol):
     group: Group
     outputs: dict[str, Outputs]
     recovery: dict[str, AnyRecovery]
+    lock: threading.RLock
 
     @property
     def quick(self) -> bool:
@@ -38,20 +41,40 @@ class Host(Protocol):
     def step(self, now: int | None) -> bool:
         """Handle the next sample that is due; whether there was one."""
 
+    def handle_what_is_due(self) -> bool:
+        """Handle all that is due; whether more may be."""
+
     def break_down(self, error: BaseException) -> None:
         """End with an error."""
 
 
 class LocalSources:
-    """Takes what the threads of the sources bring."""
+    """Takes what the threads of the sources bring, and orders for these."""
 
-    def __init__(self, host: Host) -> None:
+    def __init__(self, host: Host, sources: Mapping[str, Source]) -> None:
         self._host = host
+        self.threads = SourceThreads(sources, self, host.lock, replay=host.plan.replay)
         self._replay = host.plan.replay
         self._feeds = host.group.feeds
         self._present = Present()
         self._brought = 0  # samples of a replay
         self._readers = {node: host.group.readers_of(node) for node in self._feeds}
+
+    def hear(self, event: Brought | Started | Opened | SourcesEnd | SourcesEnded) -> None:
+        """Take an event that is for the sources, or comes from them; with the lock held."""
+        match event:
+            case Brought():
+                self.take(event.node, event.port, event.sample)
+            case Started():
+                self.threads.start()
+            case Opened():
+                self.threads.open(event.until)
+            case SourcesEnd():
+                self.threads.stop_and(lambda: self._host.bus.put(SourcesEnded()))
+            case SourcesEnded():
+                while self._host.handle_what_is_due():
+                    pass
+                self._host.bus.declare_gone(self._feeds)  # what they brought is sent: others may end
 
     def bring(self, node: str, port: str, sample: Sample | Encoded) -> None:
         """Take a sample, and do what follows; by the inbox while the process is not quick."""

@@ -20,6 +20,8 @@ from caneflow.runtime.hosts.process.events import (
     Marked,
     Opened,
     SinkAsked,
+    SourcesEnd,
+    SourcesEnded,
     Started,
     Stopped,
     Timed,
@@ -30,7 +32,6 @@ from caneflow.runtime.hosts.process.local_sources import LocalSources
 from caneflow.runtime.hosts.process.outputs import Outputs
 from caneflow.runtime.hosts.process.quickness import Quickness
 from caneflow.runtime.hosts.process.sayings import Sayings
-from caneflow.runtime.hosts.process.source_threads import SourceThreads
 from caneflow.runtime.hosts.process.speaker import speak_for
 from caneflow.runtime.plan import ProcessPlan
 from caneflow.runtime.program import Operator, Sink, Source
@@ -58,9 +59,7 @@ class Process:
         self.recovery: dict[str, AnyRecovery] = recoveries(plan, self.group, self.outputs, snapshots, self.lock)
         self.says = Sayings(plan, bus, self.group, self.inputs, self.outputs, self.recovery)
         self._recoveries = list(dict.fromkeys(self.recovery.values()))
-        sources = {name: program for name, program in built.items() if isinstance(program, Source)}
-        self.local = LocalSources(self)
-        self.sources = SourceThreads(sources, self.local, self.lock, replay=plan.replay)
+        self.local = LocalSources(self, {name: each for name, each in built.items() if isinstance(each, Source)})
         self.stopped = False
         self._alone = len(plan.nodes) == 1
         self._quickness = Quickness()
@@ -78,7 +77,7 @@ class Process:
                 recovery.note_failure()
             raise
         finally:
-            self.sources.stop()
+            self.local.threads.stop()
             if self.taps:
                 self.bus.hear_out()
             self.take_no_more()
@@ -95,7 +94,7 @@ class Process:
             for outputs in self.outputs.values() if resumed else ():
                 outputs.send_again()  # what came since the snapshot is asked for
             self.local.catch_up(brought for recovery in self._recoveries for brought in recovery.brought_since())
-        self.sources.begin()
+        self.local.threads.begin()
         more = False
         while not self.stopped:
             came = self.take_events(timeout=0 if more else self.look_period)
@@ -110,7 +109,7 @@ class Process:
                 self.says.what_is_due()
             self.keep_snapshots()
         if self.group.feeds:
-            self.sources.stop()
+            self.local.threads.stop()
             self.take_events(timeout=0)  # what they brought last
             with self.lock:
                 self.handle_what_is_due()
@@ -164,12 +163,8 @@ class Process:
                 self.taps[event.node].note(event.key, event.payload, time.time_ns())
             case SinkAsked():
                 self.bus.answer_question(event, self.taps[event.node].asked(event.question, time.time_ns()))
-            case Brought():
-                self.local.take(event.node, event.port, event.sample)
-            case Started():
-                self.sources.start()
-            case Opened():
-                self.sources.open(event.until)
+            case Brought() | Started() | Opened() | SourcesEnd() | SourcesEnded():
+                self.local.hear(event)
             case Timed():
                 for inputs in self.inputs.values():
                     inputs.set_clock(event.clock)
