@@ -55,11 +55,11 @@ if __name__ == "__main__":
 """
 
 
-def grouped(path: Path, processes: Mapping[str, str], more: str = "") -> Path:
-    """The cane's dataflow.yaml; `processes`: by node the one that it shares."""
+def grouped(path: Path, processes: Mapping[str, str], flow: str = "grouped") -> Path:
+    """The cane's dataflow.yaml; `processes`: by node the one that it shares. `flow`: a name that no other test runs."""
     shared = {name: f", process: {process}" for name, process in processes.items()}
     nodes = "\n".join(f"  {name}: {{{node}{shared.get(name, '')}}}" for name, node in NODES.items())
-    path.write_text(f"flow: grouped\n{more}nodes:\n{nodes}\nresults: [fusion/pose]\n")
+    path.write_text(f"flow: {flow}\nnodes:\n{nodes}\nresults: [fusion/pose]\n")
     return path
 
 
@@ -147,14 +147,12 @@ def test_a_group_with_the_recorder_ends_its_sources_before_an_operator_outside(t
 
 
 def test_in_a_replay_the_process_of_the_recorder_is_never_started_again(tmp_path: Path) -> None:
-    walk, flow = (
-        write_walk(tmp_path / "walk.mcap", 1000),
-        grouped(tmp_path / "flow.yaml", dict.fromkeys(NODES, "recorder")),
-    )
+    walk = write_walk(tmp_path / "walk.mcap", 1000)
+    flow = grouped(tmp_path / "flow.yaml", dict.fromkeys(NODES, "recorder"), "recorded")
     with launchers() as launch:
         launched = launch("run", flow, "--replay", walk, "--record", tmp_path / "out.mcap", log=tmp_path / "log")
         launched.wait_for("ready: 5 nodes")
-        refused = caneflow("restart", "grouped", "fusion")
+        refused = caneflow("restart", "recorded", "fusion")
         assert (refused.returncode, refused.stdout) == (2, "")
         assert "the recording of a replay is its result" in refused.stderr
         node_processes(launched.process.pid)["recorder"].kill()
@@ -163,7 +161,10 @@ def test_in_a_replay_the_process_of_the_recorder_is_never_started_again(tmp_path
 
 
 def test_a_group_in_a_replay_that_is_asked_to_restart_computes_the_same_bytes(tmp_path: Path) -> None:
-    walk, flow = write_walk(tmp_path / "walk.mcap", 250), grouped(tmp_path / "flow.yaml", dict.fromkeys(NODES, "cane"))
+    walk, flow = (
+        write_walk(tmp_path / "walk.mcap", 250),
+        grouped(tmp_path / "flow.yaml", dict.fromkeys(NODES, "cane"), "asked"),
+    )
     alone, out = tmp_path / "alone.mcap", tmp_path / "out.mcap"
     with launchers() as launch:
         launched = launch("run", flow, "--replay", walk, "--in-process", "--record", alone, log=tmp_path / "log")
@@ -171,7 +172,7 @@ def test_a_group_in_a_replay_that_is_asked_to_restart_computes_the_same_bytes(tm
         launched = launch("run", flow, "--replay", walk, "--record", out, log=tmp_path / "log")
         launched.wait_for("ready: 5 nodes")
         before = node_processes(launched.process.pid)
-        assert "grouped: fusion is ready again" in caneflow("restart", "grouped", "fusion").stdout
+        assert "asked: fusion is ready again" in caneflow("restart", "asked", "fusion").stdout
         after = node_processes(launched.process.pid)
         assert launched.ends() == 0, launched.said
     assert after.keys() == before.keys() == {"cane", "recorder"}
