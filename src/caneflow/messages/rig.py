@@ -71,6 +71,21 @@ class Ranger(BaseModel):
         return self
 
 
+class Guidance(BaseModel):
+    """What one person wants to hear and feel of the cues."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    volume: Annotated[float, Field(ge=0, le=1, description="of sounds and vibration; 0: none")] = 0.5
+    range: Annotated[float, Field(ge=0.3, le=10, description="m, beyond which nothing is told")] = 3.0
+    levels: Annotated[
+        tuple[Literal["low", "waist", "head", "drop"], ...], Field(max_length=4, description="that are told of")
+    ] = ("low", "waist", "head", "drop")
+    tick: Annotated[float, Field(ge=0, le=60, description="s of silence until a soft tick says it runs; 0: never")] = (
+        5.0
+    )
+
+
 class User(BaseModel):
     """The person who holds the cane."""
 
@@ -81,6 +96,7 @@ class User(BaseModel):
     hand: Annotated[
         tuple[Lever, Lever], Field(description="m, of the hand ahead and to the left of the body's middle")
     ] = (0.30, -0.08)
+    guidance: Annotated[Guidance, Field(description="what the person wants to hear and feel")] = Guidance()
 
 
 class Rig(BaseModel):

@@ -15,5 +15,13 @@ def build(program: Program, plan: NodePlan) -> Operator | Source | Sink:
     random = generator(plan.seed, plan.node)
     keys = {port: wire.key for port, wire in ports.items()}
     rig = read_rig(plan.rig)
-    context = Context(node=plan.node, rig=rig, ports=kinds, random=random, keys=keys, replay=plan.replay)
+    context = Context(
+        node=plan.node,
+        rig=rig,
+        ports=kinds,
+        random=random,
+        keys=keys,
+        replay=plan.replay,
+        takes_over=plan.takes_over,
+    )
     return program(settings, context)

@@ -59,6 +59,7 @@ class Context:
     random: np.random.Generator  # from the graph's seed and the node's name: other nodes do not change it
     keys: Mapping[str, str] = field(default_factory=dict)  # by the same ports: <flow>/<node>/<port> of the stream
     replay: bool = False  # the sources are recordings: nothing may be lost, everybody waits
+    takes_over: bool = False  # in the place of a process that ended: what that one had taken does not come again
 
 
 class InFlow(NamedTuple):

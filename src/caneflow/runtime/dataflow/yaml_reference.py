@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from caneflow.messages.rig import Ranger, Rig, Sensor, Start, User
+from caneflow.messages.rig import Guidance, Ranger, Rig, Sensor, Start, User
 from caneflow.runtime.dataflow.validation import Checked
 from caneflow.runtime.dataflow.yaml_shape import (
     FlowShape,
@@ -33,6 +33,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "start": Start,
     "ranger": Ranger,
     "user": User,
+    "guidance": Guidance,
 }
 REQUIRED = {"flow": {"flow", "nodes"}, "node": {"run"}}  # besides those that the types cannot do without
 
