@@ -24,6 +24,7 @@ from caneflow.messages import (
     Imu,
     Pose,
     RadarFrame,
+    RadarPoints,
     Ranges,
     Sample,
     bounds,
@@ -42,6 +43,7 @@ from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.snapshot import pack
 from operators.attitude import Attitude
 from operators.doppler import Doppler
+from operators.ego_velocity import EgoVelocityOperator
 from operators.fusion import Fusion
 from operators.ground_speed import GroundSpeedOperator
 from operators.room_tracker import RoomTrackerOperator
@@ -194,6 +196,20 @@ class World:
             velocity_delay=self.maybe(lambda: self.number(0.03, 0.0, bounds.DELAY)),
         )
 
+    def points(self, stamp: int) -> RadarPoints:
+        count = self.dice.choice((0, 1, 9, 300)) if self.is_wild(0.3) else 20
+        position = self.array((count, 3), "f", 2.0, bounds.POINT) if count else np.zeros((0, 3), np.float32)
+        doppler = self.array((count,), "f", 0.5, bounds.RANGE_RATE) if count else np.zeros(0, np.float32)
+        return RadarPoints(
+            stamp=stamp,
+            position=position,
+            doppler=doppler,
+            snr=self.maybe(lambda: np.full(count, self.number(20.0, -bounds.SNR, bounds.SNR), np.float32)),
+            frame_time=self.number(0.02, 0.0, bounds.FRAME_TIME),
+            doppler_step=self.number(0.1, *bounds.DOPPLER_STEP),
+            doppler_limit=self.number(2.0, *bounds.DOPPLER_STEP),
+        )
+
     def pose(self, stamp: int) -> Pose:
         return Pose(
             stamp=stamp,
@@ -247,6 +263,7 @@ class World:
         make: dict[type[Sample], Callable[[int], Sample]] = {
             Imu: self.imu,
             RadarFrame: self.frame,
+            RadarPoints: self.points,
             GroundSpeed: self.ground_speed,
             Pose: self.pose,
             DopplerBlock: self.block,
@@ -300,6 +317,7 @@ CASES = {
     "fusion luenberger heading": Case(Fusion, SPEED, {"luenberger": {"compensate_delay": "heading"}}),
     "fusion luenberger motion": Case(Fusion, SPEED, {"luenberger": {"compensate_delay": "motion"}}),
     "ground_speed": Case(GroundSpeedOperator, {"frame": RadarFrame, "imu": Imu}, most=300),
+    "ego_velocity": Case(EgoVelocityOperator, {"points": RadarPoints, "imu": Imu}),
     "attitude attitude_filter": Case(Attitude, IMU),
     "attitude madgwick": Case(Attitude, IMU, {"method": "madgwick", "madgwick": {"bias_gain": 0.01}}),
     "doppler": Case(Doppler, {"block": DopplerBlock}, {"sensor": "south", "spectrum": {"window": 0.064}}),

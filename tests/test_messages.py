@@ -27,6 +27,7 @@ from caneflow.messages import (
     Obstacles,
     Pose,
     RadarFrame,
+    RadarPoints,
     RadarTargets,
     Ranges,
     Sample,
@@ -64,7 +65,8 @@ EXAMPLES: list[Sample] = [
     GroundSpeed(stamp=8, speed=0.0, quality=math.inf, rays=0, valid=False),
     GroundSpeed(
         stamp=9, speed=1.1, quality=0.05, rays=12, valid=True, delay=0.32,
-        velocity=(1.0, 0.1), velocity_cov=(0.01, 0.0, 1e6), velocity_delay=0.03,
+        velocity=(1.0, 0.1), velocity_cov=(0.01, 0.0, 1e6), velocity_delay=0.03, vertical=-0.02,
+        vertical_sd=0.03,
     ),
     Pose(
         stamp=10, position=(1.0, 2.0, 3.0), velocity=(0.0, 0.0, 0.0), orientation=(0.0, 0.0, 0.0, 1.0),
@@ -97,6 +99,15 @@ EXAMPLES: list[Sample] = [
     Cue(stamp=17, kind="none", since=17),
     Cue(stamp=18, kind="obstacle", level="head", distance=1.9, azimuth=-0.1, urgency=0.4, time=2.1, since=17),
     Cue(stamp=19, kind="blind", reason="tof_up/ranges", since=18),
+    RadarPoints(
+        stamp=20, position=np.zeros((0, 3), np.float32), doppler=np.zeros(0, np.float32), frame_time=0.0185,
+        doppler_step=0.125, doppler_limit=2.0,
+    ),
+    RadarPoints(
+        stamp=20, position=np.array([[2.0, -0.5, 0.1]], np.float32), doppler=np.array([0.5], np.float32),
+        snr=np.array([14.0], np.float32), noise=np.array([31.0], np.float32), frame_time=0.0185, doppler_step=0.125,
+        doppler_limit=2.0,
+    ),
 ]  # fmt: skip
 
 
@@ -157,6 +168,7 @@ def fields_of(message: Sample, **changes: object) -> bytes:
 
 
 IMU, FRAME, SPEED, POSE, BLOCK, TARGET = (EXAMPLES[i] for i in (0, 2, 4, 5, 6, 7))
+POINTS = EXAMPLES[-1]
 NAN = float("nan")
 
 
@@ -236,6 +248,13 @@ def test_what_breaks_the_contract_is_refused_by_name(message: Sample, changes: d
         (TARGET, {"snr": 1e9}, "snr is 1000000000.0; expected -400 to 400 dB"),
         (TARGET, {"range": 1e30}, "range is 1e+30; expected 0 to 1e+06 m"),
         (TARGET, {"delay": 1e308}, "delay is 1e+308; expected 0 to 60 s"),
+        (POINTS, {"position": np.full((1, 3), 1e5, np.float32)}, "position has an element of 100000; expected -10000"),
+        (POINTS, {"position": np.zeros((1, 2), np.float32)}, "position has shape (1, 2); expected (n, 3)"),
+        (POINTS, {"position": np.zeros((1, 3))}, "position is of dtype float64; allowed are float32"),
+        (POINTS, {"doppler": np.zeros(0, np.float32)}, "doppler has 0 elements for 1 points; expected one for each"),
+        (POINTS, {"doppler": np.array([np.nan], np.float32)}, "doppler has elements that are NaN or infinite"),
+        (POINTS, {"snr": np.array([1e9], np.float32)}, "snr has an element of 1e+09; expected -400 to 400"),
+        (POINTS, {"doppler_step": 0.0}, "doppler_step is 0.0; expected 1e-06 to 1000 m/s"),
     ],
 )  # fmt: skip
 def test_what_no_sensor_can_say_is_refused(message: Sample, changes: dict[str, Any], cause: str) -> None:
@@ -270,7 +289,7 @@ def bounds_of(spec: dict[str, Any]) -> Iterator[tuple[float, float]]:
         yield from bounds_of(inner)
 
 
-@pytest.mark.parametrize("message", [IMU, FRAME, SPEED, POSE, BLOCK, TARGET], ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("message", [IMU, FRAME, SPEED, POSE, BLOCK, TARGET, POINTS], ids=lambda m: type(m).__name__)
 def test_every_number_of_every_message_has_bounds_that_its_schema_says(message: Sample) -> None:
     """At a bound a number is taken, just beyond it is not: a new field without bounds fails here."""
     for name, spec in json_schema(type(message))["properties"].items():

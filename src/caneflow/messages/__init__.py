@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from caneflow.messages.errors import MessageError
     from caneflow.messages.keys import NAME, NAME_RULE, control_key, sample_key, stream_of
     from caneflow.messages.motion import GroundSpeed, Imu, Pose
-    from caneflow.messages.radar import DopplerBlock, DopplerTarget, RadarFrame
+    from caneflow.messages.radar import DopplerBlock, DopplerTarget, RadarFrame, RadarPoints
     from caneflow.messages.registry import SAMPLES
     from caneflow.messages.sample import Sample
     from caneflow.messages.surroundings import Cue, Grid, Obstacles, RadarTargets, Ranges
@@ -29,6 +29,7 @@ __all__ = [
     "Obstacles",
     "Pose",
     "RadarFrame",
+    "RadarPoints",
     "RadarTargets",
     "Ranges",
     "Sample",
@@ -48,7 +49,7 @@ LIGHT = {  # where what needs no numpy is, which takes as long to import as all 
 }
 FAMILIES = {  # the file of each family: what it defines
     "motion": ("Imu", "GroundSpeed", "Pose"),
-    "radar": ("RadarFrame", "DopplerBlock", "DopplerTarget"),
+    "radar": ("RadarFrame", "RadarPoints", "DopplerBlock", "DopplerTarget"),
     "surroundings": ("Ranges", "RadarTargets", "Grid", "Obstacles", "Cue"),
 }
 ROOMS = LIGHT | {"Sample": "sample"} | {name: family for family, names in FAMILIES.items() for name in names}

@@ -50,6 +50,10 @@ RANGE_RATE = 1000.0  # m/s: three times the speed of sound
 SNR = 400.0  # dB: more than the largest float32 over the last bit of 24
 TARGET_RANGE = 1e6  # m: as RANGE_START
 
+POINT = 1e4  # m from a radar to a point: as RANGE
+FRAME_TIME = 60.0  # s: as SCAN_PERIOD
+DOPPLER_STEP = (1e-6, RANGE_RATE)  # m/s: a frame of a minute at 77 GHz has 3e-5
+
 RANGE = 1e4  # m along a ray: the farthest laser range finders in the hand end at 10 km
 LIGHT = 1e9  # of a range sensor's signal and ambient light, in its units: counts of 30 bits
 LOG_ODDS = (1e-6, 100.0)  # nat per count: a thousand counts to see a difference; one count that settles everything
@@ -74,6 +78,7 @@ Cosine: TypeAlias = Annotated[float, _within(-1.0 - UNIT_TOLERANCE, 1.0 + UNIT_T
 Level: TypeAlias = Annotated[int, _within(0, 3)]
 Speed: TypeAlias = Annotated[float, _within(-SPEED, SPEED)]
 Spread: TypeAlias = Annotated[float, Meta(extra_json_schema={"minimum": 0.0})]
+Deviation: TypeAlias = Annotated[float, _within(0.0, SPREAD)]
 SpeedVariance: TypeAlias = Annotated[float, _within(-SPEED_VARIANCE, SPEED_VARIANCE)]
 Rays: TypeAlias = Annotated[int, _within(0, RAYS)]
 Delay: TypeAlias = Annotated[float, _within(0.0, DELAY)]
@@ -88,6 +93,8 @@ SampleRate: TypeAlias = Annotated[float, _within(*SAMPLE_RATE)]
 Amplitude: TypeAlias = Annotated[float, _within(0.0, AMPLITUDE)]
 RangeRate: TypeAlias = Annotated[float, _within(-RANGE_RATE, RANGE_RATE)]
 Snr: TypeAlias = Annotated[float, _within(-SNR, SNR)]
+FrameTime: TypeAlias = Annotated[float, _within(0.0, FRAME_TIME)]
+DopplerStep: TypeAlias = Annotated[float, _within(*DOPPLER_STEP)]
 TargetRange: TypeAlias = Annotated[float, _within(0.0, TARGET_RANGE)]
 LogOdds: TypeAlias = Annotated[float, _within(*LOG_ODDS)]
 CellSize: TypeAlias = Annotated[float, _within(*CELL_SIZE)]
@@ -138,11 +145,15 @@ def require_covariance(name: str, covariance: tuple[float, float, float]) -> Non
         raise ValueError(f"{name} is {covariance}; expected xy^2 to be at most xx times yy")
 
 
-def require_array(name: str, array: Array, letters: str, *, dimensions: int, most: float) -> None:
+def require_array(
+    name: str, array: Array, letters: str, *, dimensions: int, most: float, may_be_empty: bool = False
+) -> None:
     """Raise ValueError unless dtype and number of dimensions fit, and every part of a float within `most`."""
     if array.dtype.char not in letters:
         allowed = ", ".join(str(np.dtype(letter)) for letter in letters)
         raise ValueError(f"{name} is of dtype {array.dtype}; allowed are {allowed}")
+    if may_be_empty and array.ndim == dimensions and array.size == 0:
+        return
     if array.ndim != dimensions or array.size == 0:
         raise ValueError(f"{name} has shape {array.shape}; it takes {dimensions} dimensions, none of them empty")
     if array.dtype.kind in "fc":

@@ -76,6 +76,10 @@ class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fals
         SpeedVariances | None, Meta(description="xx, xy, yy of velocity, m^2/s^2; 1e6: not observed")
     ] = None
     velocity_delay: Annotated[bounds.Delay | None, Meta(description="s by which velocity lags the stamp")] = None
+    vertical: Annotated[bounds.Speed | None, Meta(description="m/s, upward speed of the radar; lags as velocity")] = (
+        None
+    )
+    vertical_sd: Annotated[bounds.Deviation | None, Meta(description="m/s, its standard deviation")] = None
 
     def __post_init__(self) -> None:
         require_within("speed", self.speed, -bounds.SPEED, bounds.SPEED, "m/s")
@@ -90,6 +94,10 @@ class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fals
             require_covariance("velocity_cov", self.velocity_cov)
         if self.velocity_delay is not None:
             require_within("velocity_delay", self.velocity_delay, 0.0, bounds.DELAY, "s")
+        if self.vertical is not None:
+            require_within("vertical", self.vertical, -bounds.SPEED, bounds.SPEED, "m/s")
+        if self.vertical_sd is not None:
+            require_within("vertical_sd", self.vertical_sd, 0.0, bounds.SPREAD, "m/s")
 
 
 class Pose(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):

@@ -1,4 +1,4 @@
-"""Radar: scans of a pulse-Doppler radar, sound of a Doppler module, and the target in it. SI units, stamps in ns."""
+"""Radar: scans, points with Doppler, sound of a Doppler module, and the target in it. SI units, stamps in ns."""
 
 from typing import Annotated
 
@@ -35,6 +35,41 @@ class RadarFrame(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False
         require_within("range_step", self.range_step, *bounds.RANGE_STEP, "m")
         require_within("carrier", self.carrier, *bounds.CARRIER, "Hz")
         require_within("bandwidth", self.bandwidth, *bounds.BANDWIDTH, "Hz")
+
+
+class RadarPoints(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):
+    """Points of one frame of an imaging radar, each with its Doppler; the stamp is that of the frame's last chirp."""
+
+    schema = "caneflow.RadarPoints/1"
+
+    position: Annotated[Array, Meta(description="(n, 3) float32 m, radar frame: x boresight, y left, z up; n may be 0")]
+    doppler: Annotated[Array, Meta(description="(n,) float32 m/s, positive for approaching")]
+    frame_time: Annotated[bounds.FrameTime, Meta(description="s from the first to the last chirp")]
+    doppler_step: Annotated[bounds.DopplerStep, Meta(description="m/s, width of a Doppler bin")]
+    doppler_limit: Annotated[bounds.DopplerStep, Meta(description="m/s, unambiguous to either side of zero")]
+    snr: Annotated[Array | None, Meta(description="(n,) float32 dB")] = None
+    noise: Annotated[Array | None, Meta(description="(n,) float32 dB")] = None
+
+    def __post_init__(self) -> None:
+        require_array("position", self.position, "f", dimensions=2, most=bounds.POINT, may_be_empty=True)
+        points = len(self.position)
+        if self.position.shape != (points, 3):
+            raise ValueError(f"position has shape {self.position.shape}; expected (n, 3)")
+        require_one_each("doppler", self.doppler, points, bounds.RANGE_RATE)
+        if self.snr is not None:
+            require_one_each("snr", self.snr, points, bounds.SNR)
+        if self.noise is not None:
+            require_one_each("noise", self.noise, points, bounds.SNR)
+        require_within("frame_time", self.frame_time, 0.0, bounds.FRAME_TIME, "s")
+        require_within("doppler_step", self.doppler_step, *bounds.DOPPLER_STEP, "m/s")
+        require_within("doppler_limit", self.doppler_limit, *bounds.DOPPLER_STEP, "m/s")
+
+
+def require_one_each(name: str, values: Array, points: int, most: float) -> None:
+    """Raise ValueError unless there is one float32 within `most` for each of the points."""
+    require_array(name, values, "f", dimensions=1, most=most, may_be_empty=True)
+    if len(values) != points:
+        raise ValueError(f"{name} has {len(values)} elements for {points} points; expected one for each")
 
 
 class DopplerBlock(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):

@@ -17,6 +17,7 @@ FieldOfView: TypeAlias = Annotated[float, Ge(1e-3), Le(3.15)]  # rad
 Reach: TypeAlias = Annotated[float, Ge(0), Le(1e4)]  # m
 Direction: TypeAlias = tuple[Component, Component, Component]
 Levers: TypeAlias = tuple[Lever, Lever, Lever]
+Rotation: TypeAlias = tuple[Component, Component, Component, Component]  # as Component
 Area: TypeAlias = tuple[Place, Place, Place, Place]
 
 MOST_CAUSES = 20  # that are told of one rig
@@ -111,6 +112,13 @@ class Rig(BaseModel):
     )
     hand_height: Annotated[float | None, Field(ge=0.01, le=10, description="m, of the hand above ground")] = None
     aperture: Annotated[float | None, Field(ge=1e-3, lt=3.2, description="rad, full -3 dB angle (delta)")] = None
+    aperture_across: Annotated[
+        float | None, Field(ge=1e-3, lt=3.2, description="rad, full -3 dB angle across the cane; default: aperture")
+    ] = None
+    radar_orientation: Annotated[
+        Rotation | None,
+        Field(description="w x y z, radar to body frame; default: x on boresight, y horizontal in a level cane"),
+    ] = None
     pivot: Annotated[Levers | None, Field(description="m, from the sensors to the hand, body frame")] = None
     antenna: Annotated[Levers, Field(description="m, from IMU to antenna, body frame")] = (0.0, 0.0, 0.0)
     step_length: Annotated[float | None, Field(ge=0.01, le=10, description="m, step-and-heading only")] = None
@@ -125,6 +133,15 @@ class Rig(BaseModel):
     @classmethod
     def _unit(cls, boresight: Direction) -> Direction:
         return require_direction(boresight)
+
+    @field_validator("radar_orientation")
+    @classmethod
+    def _rotation(cls, orientation: Rotation | None) -> Rotation | None:
+        if orientation is not None:
+            norm = sum(x * x for x in orientation) ** 0.5
+            if abs(norm - 1) > 1e-3:
+                raise ValueError(f"has norm {norm:.6g}; a rotation has 1")
+        return orientation
 
     def need(self, name: str) -> Any:
         """The value of key `name`; raises MessageError when it is not known."""

@@ -4,9 +4,12 @@ import math
 from bisect import bisect_left, bisect_right
 from typing import Final
 
-from caneflow.algorithms.rotations import Quaternion, Vector, normalized
+from caneflow.algorithms.rotations import Quaternion, Vector, from_rotation_vector, multiply, normalized
 
 LONGEST_STEP_NS: Final = 100_000_000  # ns between samples over which an attitude may be interpolated
+# ns past the newest sample, over which the gyro tells how it went on. A hand turns the cane with up to 20 rad/s^2: half
+# a degree in that time.
+LONGEST_AHEAD_NS: Final = 30_000_000
 
 
 class AttitudeHistory:
@@ -16,6 +19,7 @@ class AttitudeHistory:
         self._samples = samples
         self._stamps: list[int] = []  # ns
         self._orientations: list[Quaternion] = []
+        self._gyro: Vector = (0.0, 0.0, 0.0)  # rad/s, of the newest
         self._turned: list[float] = []  # rad, path length of the rotation since the first sample
 
     def add(self, stamp_ns: int, orientation: Quaternion, gyro: Vector) -> None:
@@ -30,6 +34,7 @@ class AttitudeHistory:
             if elapsed_ns <= 0:
                 raise ValueError(f"attitude at {stamp_ns} ns is not newer than the last, {self._stamps[-1]} ns")
             turned = self._turned[-1] + math.hypot(*gyro) * elapsed_ns * 1e-9
+        self._gyro = gyro
         self._stamps.append(stamp_ns)
         self._orientations.append(orientation)
         self._turned.append(turned)
@@ -50,6 +55,17 @@ class AttitudeHistory:
             return None
         older_ns, older = self._stamps[after - 1], self._orientations[after - 1]
         return _between(older, newer, (stamp_ns - older_ns) / (newer_ns - older_ns))
+
+    def near(self, stamp_ns: int) -> Quaternion | None:
+        """As `at`, and for a short while past the newest sample the attitude to which its turn rate leads."""
+        if not self._stamps or stamp_ns <= self._stamps[-1]:
+            return self.at(stamp_ns)
+        ahead_ns = stamp_ns - self._stamps[-1]
+        if ahead_ns > LONGEST_AHEAD_NS:
+            return None
+        x, y, z = self._gyro
+        ahead = ahead_ns * 1e-9
+        return normalized(multiply(self._orientations[-1], from_rotation_vector((x * ahead, y * ahead, z * ahead))))
 
     def mean_turn_rate(self, start_ns: int, end_ns: int) -> float | None:
         """Mean norm of the turn rate (rad/s) of the samples in `start_ns`..`end_ns`; None if there are not two."""
