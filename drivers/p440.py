@@ -38,6 +38,8 @@ BAUD_RATE = 115_200  # of the UART; USB takes any
 
 ANSWER_TIME = 0.25  # s that the radar has to answer
 TRIES = 4  # of a request to a radar that is there: datagrams get lost
+SAYING_PERIOD = 0.5  # s after which the driver says that nothing comes: only then can its process end it
+NOTHING_NEW = 0  # ns, before every scan: one that is on its way may be stamped at any time
 RETRY_PERIOD = 0.25  # s between two attempts at a radar that is not there
 STOP_TRIES = 3
 STILL_TIME = 0.06  # s without a scan after which a radar that was told to stop has stopped
@@ -465,7 +467,8 @@ class P440(Source):
         self._next_loss_line = max(self._next_loss_line, heard + round(FIRST_LOSS_LINE * 1e9))
         try:
             while True:
-                found = radar.next_packet(settings.silence_s - (self._clock.now() - heard) / 1e9)
+                left = settings.silence_s - (self._clock.now() - heard) / 1e9
+                found = radar.next_packet(min(left, SAYING_PERIOD))
                 if found is not None:
                     packet, heard = found
                     self._note_arrival(packet, heard)
@@ -473,6 +476,8 @@ class P440(Source):
                         yield from self._told_frames(scan)
                 elif (self._clock.now() - heard) / 1e9 >= settings.silence_s:
                     raise Silent(f"has sent no scan for {settings.silence_s:g} s")
+                else:
+                    yield Quiet(NOTHING_NEW)
         except (Silent, OSError):
             for scan in assembler.finish():
                 yield from self._told_frames(scan)

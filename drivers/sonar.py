@@ -95,7 +95,8 @@ class Sonar(Source):
 
     def _reading(self, distance: float, *, delay: float) -> Brought:
         stamp = time.time_ns()
-        if stamp <= self._last_stamp:
+        if stamp <= self._last_stamp:  # the clock was set back
+            yield Quiet(self._last_stamp)
             return
         self._last_stamp = stamp
         if self._said:

@@ -293,6 +293,18 @@ def test_an_unplugged_radar_is_back_within_a_second_of_its_return(caplog: pytest
     assert len(caplog.records) == 3, "silent, gone, and silent at the end"
 
 
+def test_a_radar_that_may_be_silent_for_long_is_said_to_be_so_twice_a_second() -> None:
+    desk = Desk(moments([scan(number) for number in range(20)]), driver={"silence_s": 30.0})
+    times: list[int] = []
+    for item in desk.driver.samples():
+        if desk.radar.over and isinstance(item, Quiet):
+            times.append(desk.world.time)
+            if len(times) == 20:
+                break
+    assert max(b - a for a, b in itertools.pairwise(times)) <= 0.6 * SECOND
+    assert times[-1] - times[0] < 20 * SECOND, "it is not given up"
+
+
 def test_an_absent_radar_is_asked_on_and_time_goes_on(caplog: pytest.LogCaptureFixture) -> None:
     world = World()
     link = UnpluggedLink(world)

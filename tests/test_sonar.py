@@ -18,7 +18,7 @@ from caneflow.protocols import i2c_socket, maxbotix
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.maxbotix import SerialWords, said, taken
 from caneflow.protocols.maxbotix_emulator import Echoes, I2cSonar, SerialSonar
-from caneflow.runtime import Context
+from caneflow.runtime import Context, Quiet
 from drivers.sonar import Sonar, SonarSettings, ranges_of
 from tools.emulate_mb1202 import nearest_of, serve_bus
 
@@ -141,6 +141,15 @@ def test_the_driver_reads_an_emulated_chip_over_its_socket(tmp_path: Path) -> No
     assert reading.delay is not None
     assert reading.delay >= maxbotix.READING_TIME
     assert not thread.is_alive()
+
+
+def test_a_clock_that_was_set_back_is_said_to_bring_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    context = Context(node="sonar", rig=Rig(), ports={"ranges": Ranges}, random=np.random.default_rng(1))
+    sonar = Sonar(SonarSettings(), context)
+    monkeypatch.setattr("time.time_ns", iter([2_000, 1_000, 3_000]).__next__)
+    brought: list[Any] = [item for _ in range(3) for item in sonar._reading(1.0, delay=0.1)]
+    assert [item[1].stamp for item in (brought[0], brought[2])] == [2_000, 3_000]
+    assert brought[1] == Quiet(2_000), "its process can end, and nobody waits"
 
 
 def test_a_bus_that_refuses_says_why_over_the_socket() -> None:
