@@ -6,7 +6,6 @@ out  imu : Imu   gyro, acceleration, magnetic field, the chip's own attitude, 10
 import logging
 import math
 import os
-import termios
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -28,13 +27,18 @@ from caneflow.protocols.bno055_link import UartLink
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.pacing import Pacing, Spacing, Verdict
 from caneflow.protocols.register_link import Faults, I2cLink, Link
+from caneflow.protocols.terminal_errors import TERMINAL_ERRORS
 from caneflow.runtime import Brought, Context, Quiet, Source
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.node import run
 
 log = logging.getLogger(__name__)
 
-LOST = (OSError, termios.error, ProtocolError)  # what a port or a chip that is gone raises
+LOST: tuple[type[Exception], ...] = (
+    OSError,
+    *TERMINAL_ERRORS,
+    ProtocolError,
+)  # what a port or a chip that is gone raises
 RETRY = 0.05  # s between two looks for a chip that is gone
 START_PATIENCE = 1.5  # s that a chip may take to start, twice what the data sheet says
 SILENCE = 0.3  # s without an answer, after which the port is opened anew
@@ -357,7 +361,7 @@ class Report:
 
 def reason_of(error: Exception) -> str:
     """What an error says, without its number."""
-    if isinstance(error, termios.error):
+    if isinstance(error, TERMINAL_ERRORS):
         return os.strerror(error.args[0])
     return getattr(error, "strerror", None) or str(error)
 
@@ -379,11 +383,11 @@ def _uart(settings: Bno055Settings) -> Iterator[Link]:
     timeout = settings.answer_timeout_ms / 1e3
     port = serial.Serial(settings.port, settings.baud, timeout=timeout, write_timeout=1.0, exclusive=True)
     try:
-        with suppress(OSError, ValueError, termios.error):  # adapters on USB have it, others need it not
+        with suppress(OSError, ValueError, *TERMINAL_ERRORS):  # adapters on USB have it, others need it not
             port.set_low_latency_mode(True)
         yield UartLink(port, time.sleep, time.time_ns)
     finally:
-        with suppress(OSError, termios.error):
+        with suppress(OSError, *TERMINAL_ERRORS):
             port.close()
 
 

@@ -12,7 +12,6 @@ them; docs/mcu.md has the dialogue. Stamps are the host's and come back as they 
 import errno
 import logging
 import os
-import termios
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -30,6 +29,7 @@ from caneflow.errors import not_installed
 from caneflow.messages import GroundSpeed, Imu, MessageError, Pose, Sample, decode, encode
 from caneflow.protocols import uart_frames
 from caneflow.protocols.errors import ProtocolError
+from caneflow.protocols.terminal_errors import TERMINAL_ERRORS
 from caneflow.protocols.uart_frames import NUMBERS, Deframer, Frame, Kind, PoseAnswer, Status, framed
 from caneflow.runtime import Context, Emitted, Operator, Refused
 from caneflow.runtime.errors import DataflowError
@@ -337,7 +337,7 @@ class SerialLine:
         """Send all of `data`; raises OSError when the line is broken."""
         try:
             self._port.write(data)
-        except termios.error as error:
+        except TERMINAL_ERRORS as error:
             raise OSError(*error.args) from error
 
     def receive(self) -> bytes:
@@ -345,7 +345,7 @@ class SerialLine:
         try:
             first: bytes = self._port.read(1)
             return first + self._port.read(self._port.in_waiting) if first else first
-        except termios.error as error:
+        except TERMINAL_ERRORS as error:
             raise OSError(*error.args) from error
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ from caneflow.messages.rig import Rig
 from caneflow.recording import Recording, RecordingWriter
 from caneflow.recording.playback import FASTEST, Playback, PlaybackState
 from caneflow.runtime import Context
-from caneflow.runtime.hosts.attached.followed import Came
+from caneflow.runtime.hosts.attached.flow_events import Came
 from tests.flows import wait_for
 from tools.foxglove import Foxglove, FoxgloveServer, FoxgloveSettings, Naming, flat
 

@@ -17,9 +17,9 @@ from caneflow.printable import printable
 from caneflow.runtime import Source
 from caneflow.runtime.dataflow.graph import Node
 from caneflow.runtime.dataflow.loading import load
-from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS
 from caneflow.runtime.hosts.attached.diagnosis import diagnosed
 from caneflow.runtime.hosts.attached.way_to import Finding
+from caneflow.runtime.site import DEFAULT_KEYS
 
 TROUBLE_STATUS = 1
 CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {

@@ -18,7 +18,8 @@ from caneflow.messages.codec import fields_in, plain
 from caneflow.messages.registry import SCHEMA
 from caneflow.options import At, Keys
 from caneflow.printable import printable
-from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Heard, attached, parted
+from caneflow.runtime.hosts.attached.attach import ANY, Heard, attached, parted
+from caneflow.runtime.site import DEFAULT_KEYS
 
 MOST_WAITING = 10_000  # samples that may wait to be printed
 SHOWN = 3  # elements of an array or a list on either side, on a line

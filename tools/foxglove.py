@@ -28,9 +28,9 @@ from caneflow.options import At, Keys
 from caneflow.recording import Recorded, Recording
 from caneflow.recording.playback import Playback, PlaybackState
 from caneflow.runtime import Context, Sink
-from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS
-from caneflow.runtime.hosts.attached.followed import Began, Came, Ended, Event, Told, followed, telling
+from caneflow.runtime.hosts.attached.flow_events import Began, Came, Ended, Event, Told
 from caneflow.runtime.node import run
+from caneflow.runtime.site import DEFAULT_KEYS
 
 log = logging.getLogger(__name__)
 
@@ -82,6 +82,8 @@ class Naming:
 
 
 def _serve_flow(flow: str | None, at: str | None, keys: Path, port: int, naming: Naming) -> None:
+    from caneflow.runtime.hosts.attached.followed import followed  # here, as it takes Zenoh: a recording does not
+
     with contextlib.closing(followed(flow, at, keys)) as events:
         for event in events:
             if isinstance(event, Began):
@@ -300,6 +302,8 @@ class Foxglove(Sink):
     Settings = FoxgloveSettings
 
     def __init__(self, settings: FoxgloveSettings, context: Context) -> None:
+        from caneflow.runtime.hosts.attached.followed import telling
+
         flow = next((key.partition("/")[0] for key in context.keys.values()), context.node)
         kinds = {key.partition("/")[2]: context.ports[port] for port, key in context.keys.items()}
         self._open = contextlib.ExitStack()

@@ -16,7 +16,8 @@ import typer
 from caneflow.errors import CaneflowError
 from caneflow.messages import MessageError, Sample, decode
 from caneflow.options import At, Keys
-from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Attached, Heard, attached, parted
+from caneflow.runtime.hosts.attached.attach import ANY, Attached, Heard, attached, parted
+from caneflow.runtime.site import DEFAULT_KEYS
 from caneflow.runtime.wording import in_columns
 
 WINDOW = 10.0  # s that the figures of a live table are over

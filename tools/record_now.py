@@ -10,7 +10,8 @@ from caneflow.errors import CaneflowError
 from caneflow.options import At, Keys
 from caneflow.printable import printable
 from caneflow.recording.parts import WRITE_NOW
-from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
+from caneflow.runtime.hosts.attached.attach import attached
+from caneflow.runtime.site import DEFAULT_KEYS
 
 
 def command(

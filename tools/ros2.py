@@ -46,10 +46,11 @@ from caneflow.messages.control import FlowStatus
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.options import At, Keys
 from caneflow.runtime import Context, Sink
-from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS
-from caneflow.runtime.hosts.attached.followed import Began, Came, Ended, Event, Told, followed, telling
+from caneflow.runtime.hosts.attached.flow_events import Began, Came, Ended, Event, Told
+from caneflow.runtime.hosts.attached.followed import followed, telling
 from caneflow.runtime.hosts.links.neighbours import Neighbour
 from caneflow.runtime.node import run
+from caneflow.runtime.site import DEFAULT_KEYS
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,15 +24,14 @@ from caneflow.runtime.dataflow.topology import NOBODY_LISTENS
 from caneflow.runtime.deployment import Deployment, deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.in_process import InProcess
-from caneflow.runtime.hosts.launcher.background import in_background
 from caneflow.runtime.hosts.launcher.console import Console
-from caneflow.runtime.hosts.launcher.fork_server import ForkServer
-from caneflow.runtime.hosts.launcher.launcher import Launcher
-from caneflow.runtime.hosts.launcher.open_files import raise_limit, require_open_files
 from caneflow.runtime.hosts.launcher.replay_progress import ReplayProgress
 from caneflow.runtime.outcome import Outcome, troubles
 from caneflow.runtime.replayed import Replay
 from caneflow.runtime.wording import listed
+
+if TYPE_CHECKING:
+    from caneflow.runtime.hosts.as_processes import AsProcesses
 
 SLOWEST, FASTEST = 1e-3, 1e6  # times real time: 17 min for a second; a year in half a minute, faster than any computer
 LONGEST = 1e9  # s: 32 years
@@ -113,16 +112,15 @@ def command(
 
     Example: caneflow run dataflow.yaml --replay walk.mcap --speed max --record out.mcap --set fusion.method=kalman
     """
-    raise_limit()
     _require_processes(in_process=in_process, view=view, detach=detach)
-    background = in_background() if detach else None
+    processes = None if in_process else _processes(detach=detach)
     recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
     if record is not None:
         record = named_at(record, datetime.now(UTC))
     # The recording's name first, before any process; then the fork server: what is there now is there in every node.
     with (
         _kept(record, [file, replay, rig], overwrite=overwrite, parts=bool(recorder)),
-        nullcontext() if in_process else ForkServer(silent=detach) as fork_server,
+        processes or nullcontext(),
     ):
         graph = load(file, settings or ())
         for warning in graph.warnings:
@@ -143,22 +141,29 @@ def command(
             one_process=one_process and not in_process,
             listen=_listen(listen, in_process=in_process),
         )
-        if fork_server is not None:
-            require_open_files(sum(map(deployment.runs_here, deployment.plans)))
         started = time.monotonic()
-        if fork_server is None:
-            programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
-            host = InProcess(deployment, programs)
-            with Console(deployment.flow) as console:
-                progress = ReplayProgress(deployment.origin, deployment.last, console.played)
-                outcome = host.run_until_interrupted(lambda stamp: progress.look((stamp,)))
+        if processes is None:
+            outcome = _run_here(graph, deployment)
         else:
             restarts = {name: node.restart for name, node in graph.nodes.items()}
-            keys = keys or file.parent / "keys"
-            with Console(deployment.flow, background) as console:
-                outcome = Launcher(deployment, restarts, console, fork_server, keys, view=view).run()
+            outcome = processes.run(deployment, restarts, keys or file.parent / "keys", view=view)
         summary(deployment, outcome, time.monotonic() - started)
         raise typer.Exit(outcome.status)
+
+
+def _processes(*, detach: bool) -> "AsProcesses":
+    # Imported here, as it takes Linux and Zenoh; --in-process takes neither.
+    from caneflow.runtime.hosts.as_processes import AsProcesses
+
+    return AsProcesses(detach=detach)
+
+
+def _run_here(graph: Graph, deployment: Deployment) -> Outcome:
+    programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
+    host = InProcess(deployment, programs)
+    with Console(deployment.flow) as console:
+        progress = ReplayProgress(deployment.origin, deployment.last, console.played)
+        return host.run_until_interrupted(lambda stamp: progress.look((stamp,)))
 
 
 def _kept(

@@ -9,7 +9,8 @@ import typer
 
 from caneflow.messages.control import EdgeStatus, FlowStatus, NodeStatus
 from caneflow.options import At, Keys
-from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
+from caneflow.runtime.hosts.attached.attach import attached
+from caneflow.runtime.site import DEFAULT_KEYS
 from caneflow.runtime.wording import in_columns, span
 
 PLACES = ("sender", "wire", "decode", "queue", "late")  # where a sample may be lost, on its way

@@ -10,7 +10,8 @@ import typer
 
 from caneflow.messages.control import FlowStatus, NodeStatus
 from caneflow.options import At, Keys
-from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, attached
+from caneflow.runtime.hosts.attached.attach import attached
+from caneflow.runtime.site import DEFAULT_KEYS
 from caneflow.runtime.wording import in_columns
 
 

@@ -6,11 +6,9 @@ in                    any number of streams, of any message
 
 import contextlib
 import logging
-import queue
-import threading
 import time
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,16 +18,15 @@ import typer
 from annotated_types import Ge, Le
 
 from caneflow.errors import CaneflowError, not_installed
-from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
+from caneflow.messages import MessageError, Sample, decode
 from caneflow.messages.control import FlowStatus
 from caneflow.messages.registry import SCHEMA
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.options import At, Keys
 from caneflow.runtime import Context, Sink
-from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Attached, Heard, attached
-from caneflow.runtime.hosts.launcher.run_directory import running_flows
+from caneflow.runtime.hosts.attached.flow_events import Began, Came, Ended, Told
 from caneflow.runtime.node import run
+from caneflow.runtime.site import DEFAULT_KEYS
 from caneflow.viewing.live import LiveStreams
 from caneflow.viewing.recorded import RecordedStreams
 
@@ -38,9 +35,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MOST_WAITING = 20_000  # samples that this process may be behind; what comes beyond is left out here, and counted
-STATUS_PERIOD = 1.0  # s
-SEARCH_PERIOD = 0.5  # s between two looks for a flow that is to come back
 LAST_WORDS = 0.15  # s that a page is given to hear of the end
 
 
@@ -80,93 +74,37 @@ def _show_recording(path: Path, port: int, *, open_browser: bool) -> None:
 
 def _show_flow(flow: str | None, at: str | None, keys: Path, port: int, *, open_browser: bool) -> None:
     """Show a flow, and when it has ended and is started again, the new one."""
-    with attached(flow, at, keys) as here:
-        name, status = here.flow, here.status()
-        streams = _streams(status)
+    from caneflow.runtime.hosts.attached.followed import followed  # here, as it takes Zenoh: a recording does not
+
+    with contextlib.closing(followed(flow, at, keys)) as events:
+        began = next(events)
+        assert isinstance(began, Began)
+        streams = _streams(began.status)
         with serving(streams, port) as server:
             _say(server, open_browser=open_browser)
-            _relay(here, status, streams, local=at is None)
-            while True:
-                print(f"{name} has ended; this goes on when it is started again (Ctrl-C ends it)", flush=True)
-                with _again(name, at, keys) as (here, status):
-                    streams = _streams(status)
-                    server.show(streams)
-                    _relay(here, status, streams, local=at is None)
-
-
-@contextmanager
-def _again(flow: str, at: str | None, keys: Path) -> Iterator[tuple[Attached, FlowStatus]]:
-    """Join the flow as soon as there is one of that name again."""
-    with contextlib.ExitStack() as stack:
-        while True:
-            with contextlib.suppress(DataflowError):
-                here = stack.enter_context(attached(flow, at, keys))
-                status = here.status()
-                break
-            stack.pop_all().close()
-            time.sleep(SEARCH_PERIOD)
-        yield here, status
+            for event in events:
+                match event:
+                    case Began(status=status):
+                        streams = _streams(status)
+                        server.show(streams)
+                    case Came():
+                        _take(streams, event)
+                    case Told(status, unheard):
+                        streams.tell(status, unheard)
+                    case Ended(name):
+                        streams.end()
+                        print(f"{name} has ended; this goes on when it is started again (Ctrl-C ends it)", flush=True)
 
 
 def _streams(status: FlowStatus) -> LiveStreams:
     return LiveStreams(flow=status.flow, rig=read_rig(status.rig), live=False if status.replay else None)
 
 
-def _relay(here: Attached, status: FlowStatus, streams: LiveStreams, *, local: bool) -> None:
-    """Hand on what the flow says, until it has ended."""
-    inbox: queue.Queue[tuple[Heard, int]] = queue.Queue(MOST_WAITING)
-    unheard = 0
-
-    def hear(heard: Heard) -> None:  # on Zenoh's thread: nothing but a put that does not wait
-        nonlocal unheard
-        try:
-            inbox.put_nowait((heard, time.time_ns()))
-        except queue.Full:
-            unheard += 1
-
-    kinds = {edge.writer: edge.schema for edge in status.edges}
-    with here.samples([(ANY, ANY)], hear), _Inquiry(here, streams, lambda: unheard, local=local) as inquiry:
-        while not inquiry.ended:
-            with contextlib.suppress(queue.Empty):
-                heard, received = inbox.get(timeout=0.2)
-                _take(streams, heard, received, kinds)
-    streams.end()
-
-
-def _take(streams: LiveStreams, heard: Heard, received: int, kinds: dict[str, str]) -> None:
-    with contextlib.suppress(ValueError, MessageError):  # the readers count and name what cannot be read
-        name = "/".join(stream_of(heard.key))
-        schema = heard.schema if SCHEMA.fullmatch(heard.schema) else kinds.get(name, "")
-        message = decode(heard.payload, SAMPLES.get(schema, Sample))  # of a user's own type: its stamp and number
-        streams.take(name, message, received, schema)
-
-
-class _Inquiry:
-    """Asks the launchers once a second how the flow is, on a thread of its own; a context manager."""
-
-    def __init__(self, here: Attached, streams: LiveStreams, unheard: Callable[[], int], *, local: bool) -> None:
-        self._here = here
-        self._streams = streams
-        self._unheard = unheard
-        self._local = local
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._ask, name="inquiry", daemon=True)
-        self.ended = False
-
-    def __enter__(self) -> "_Inquiry":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
-
-    def _ask(self) -> None:
-        while not (self._stopped.wait(STATUS_PERIOD) or self.ended):
-            try:
-                self._streams.tell(self._here.status(), self._unheard())
-            except DataflowError:
-                self.ended = not self._local or self._here.flow not in {found.flow for found in running_flows()}
+def _take(streams: LiveStreams, came: Came) -> None:
+    with contextlib.suppress(MessageError):  # the readers count and name what cannot be read
+        message = decode(came.payload, came.kind or Sample)  # of a user's own type: its stamp and number
+        schema = came.kind.schema if came.kind else came.schema
+        streams.take(f"{came.node}/{came.port}", message, came.received, schema if SCHEMA.fullmatch(schema) else "")
 
 
 @contextmanager
@@ -225,11 +163,12 @@ class View(Sink):
 
     def _begin(self, flow: str) -> None:
         """The first sample tells the flow's name: with it the launcher can be asked for nodes and edges."""
-        self._streams = LiveStreams(flow=flow, rig=self._rig)
+        from caneflow.runtime.hosts.attached.followed import telling
+
+        streams = self._streams = LiveStreams(flow=flow, rig=self._rig)
         self._server.show(self._streams)
-        with contextlib.suppress(DataflowError):  # no launcher on this machine: the page shows what comes here
-            here = self._open.enter_context(attached(flow))
-            self._open.enter_context(_Inquiry(here, self._streams, lambda: 0, local=True))
+        # Where no launcher answers, the page shows what comes here.
+        self._open.enter_context(telling(flow, lambda status: streams.tell(status, 0)))
 
 
 if __name__ == "__main__":

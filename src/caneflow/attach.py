@@ -15,8 +15,9 @@ from pathlib import Path
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.control import FlowStatus
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Attached, Heard
+from caneflow.runtime.hosts.attached.attach import ANY, Attached, Heard
 from caneflow.runtime.hosts.attached.attach import attached as joined
+from caneflow.runtime.site import DEFAULT_KEYS
 
 __all__ = ["Flow", "attached"]
 

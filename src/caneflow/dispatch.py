@@ -44,7 +44,7 @@ def pin() -> None:
     """Pin numpy and BLAS in this process, if numpy is not yet imported, and all in those that it will start."""
     for variable in ONE_THREAD:
         os.environ.setdefault(variable, "1")
-    machine = os.uname().machine
+    machine = _machine()
     features = [*os.environ.get("NPY_DISABLE_CPU_FEATURES", "").replace(",", " ").split(), *_numpy_features(machine)]
     os.environ.pop("NPY_ENABLE_CPU_FEATURES", None)  # numpy cannot be imported with both
     if features:
@@ -76,6 +76,11 @@ def pinned() -> tuple[str, ...]:
     return tuple(part for part, held in parts.items() if held)
 
 
+def _machine() -> str:
+    """The processor's architecture; "" on Windows, where nothing is pinned."""
+    return os.uname().machine if hasattr(os, "uname") else ""
+
+
 def _numpy_features(machine: str) -> tuple[str, ...]:
     installed = _numpy_version()
     return next((names for since, names in FEATURES.get(machine, {}).items() if installed >= since), ())
@@ -101,7 +106,7 @@ def _numpy_is_pinned() -> bool:
 
 def _blas_is_pinned() -> bool:
     """Whether every OpenBLAS in this process says that it runs the pinned kernels; another BLAS cannot be asked."""
-    expected = BLAS_CORES.get(os.uname().machine, "").lower()
+    expected = BLAS_CORES.get(_machine(), "").lower()
     cores = [_core_name(path) for path in _loaded_libraries("openblas")]
     return bool(cores) and all(core == expected for core in cores)
 
@@ -133,7 +138,7 @@ def _core_name(path: str) -> str:
 def _mathematics_are_pinned() -> bool:
     """Whether the C library chose its mathematics under the tunable: it reads that once, as the process begins."""
     if not _has_fused_mathematics():
-        return os.uname().machine == "aarch64" and bool(glibc())  # which has one version of them
+        return _machine() == "aarch64" and bool(glibc())  # which has one version of them
     begun_with = _tunables_at_start()
     return begun_with is not None and _pinned_tunables(begun_with) == begun_with
 
@@ -149,7 +154,7 @@ def _tunables_at_start() -> str | None:
 
 
 def _has_fused_mathematics() -> bool:
-    return os.uname().machine == "x86_64" and bool(glibc())
+    return _machine() == "x86_64" and bool(glibc())
 
 
 def glibc() -> str:

@@ -15,7 +15,8 @@ from types import FrameType
 from typing import NoReturn
 
 INTERRUPTED_STATUS = 130  # 128 + SIGINT, as a shell reports Ctrl-C
-NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+NUMBERS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+CAN_HOLD = hasattr(signal, "pthread_sigmask")  # Windows has neither this nor SIGHUP
 PATIENCE = 2.0  # s that undoing may take; a further signal in that time is the same wish, said twice
 
 
@@ -29,7 +30,8 @@ class _Taken:
 
 def hold() -> None:
     """Let signals wait until `end_at_once`, also in a program that takes the place of this one."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
+    if CAN_HOLD:
+        signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
 
 
 def end_at_once() -> None:
@@ -38,7 +40,8 @@ def end_at_once() -> None:
     for number in NUMBERS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup, or a shell's job in the background
             signal.signal(number, _take)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, NUMBERS)
+    if CAN_HOLD:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, NUMBERS)
 
 
 def begin_work() -> None:

@@ -5,7 +5,6 @@ for a recording that a flow writes while it runs, `require_free` for the check a
 """
 
 import errno
-import fcntl
 import os
 import re
 import shutil
@@ -19,6 +18,13 @@ from pathlib import Path
 from typing import overload
 
 from caneflow.errors import CaneflowError
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # not on Windows, where no flow runs that could be writing a file
+    CAN_LOCK = False
+else:
+    CAN_LOCK = True
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # such an error names no file
 LOOKED_AT = 4096  # bytes of an existing file that tell which picture it is
@@ -149,7 +155,8 @@ def reserved(path: Path, *, inputs: Inputs = (), overwrite: bool = False) -> Ite
 def share_lock(descriptor: int) -> None:
     """Mark an open file as being written, for as long as it is open: `--overwrite` does not replace it."""
     with suppress(OSError):  # a file system without locks: the file's name alone protects it
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        if CAN_LOCK:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 def named_at(path: Path, now: datetime) -> Path:
@@ -184,6 +191,8 @@ def _require_replaceable(
 
 def _require_unused(descriptor: int, path: Path) -> None:
     """Raise OutputError if a flow writes this file; else it is locked until the descriptor is closed or shares it."""
+    if not CAN_LOCK:
+        return
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

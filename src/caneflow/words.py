@@ -16,6 +16,9 @@ from caneflow.errors import CaneflowError
 from caneflow.printable import printable
 
 TOOLS = "caneflow.tools"
+# What running flows take, and where one of it is missing, what works all the same.
+OF_LINUX = frozenset({"zenoh", "fcntl", "resource", "pwd", "termios", "setproctitle"})
+ANYWHERE = "recordings work anywhere: `caneflow run FILE --replay REC --in-process`, eval, plot, view REC"
 USAGE_STATUS = 2  # exit status of an expected error, as of a misspelt option
 # UsageError, which typer does not name: of click, or of its own copy of click.
 MISUSE = cast(type[Exception], typer.BadParameter.__mro__[1])
@@ -112,6 +115,10 @@ def run() -> NoReturn:
         if error.filename is None:
             raise
         _fail(f"{error.filename}: {error.strerror}")
+    except ModuleNotFoundError as error:
+        if error.name not in OF_LINUX:
+            raise
+        _fail(f"needs Linux and Zenoh (there is no {error.name} here); {ANYWHERE}")
     except KeyboardInterrupt:
         sys.exit(interrupts.INTERRUPTED_STATUS)
     sys.exit(status)  # of a typer.Exit, or None

@@ -11,12 +11,7 @@ from pathlib import Path
 
 from caneflow.runtime.building import build
 from caneflow.runtime.dataflow.programs import Located, program_at
-from caneflow.runtime.hosts.process.bus import Bus
-from caneflow.runtime.hosts.process.events import SourcesEnd, Stopped
 from caneflow.runtime.hosts.process.last_words import telling_failures
-from caneflow.runtime.hosts.process.process import Process
-from caneflow.runtime.hosts.process.source_threads import SOURCES_END
-from caneflow.runtime.hosts.process.sources import SourceProcess
 from caneflow.runtime.hosts.process.speaker import name_speakers
 from caneflow.runtime.plan import NodePlan, ProcessPlan
 from caneflow.runtime.program import Program, Source
@@ -57,6 +52,13 @@ def _program(plan: NodePlan) -> Program:
 
 
 def _run(programs: Mapping[str, Program], process: ProcessPlan, snapshots: Path) -> None:
+    # Imported here, as it takes Zenoh: a program is imported by many who do not run it as a process.
+    from caneflow.runtime.hosts.process.bus import Bus
+    from caneflow.runtime.hosts.process.events import SourcesEnd, Stopped
+    from caneflow.runtime.hosts.process.process import Process
+    from caneflow.runtime.hosts.process.source_threads import SOURCES_END
+    from caneflow.runtime.hosts.process.sources import SourceProcess
+
     with telling_failures(building=True):
         built = {name: build(programs[name], plan) for name, plan in process.members.items()}
     with Bus(process) as bus:

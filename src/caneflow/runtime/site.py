@@ -3,11 +3,14 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from caneflow.runtime.dataflow.graph import Graph, Node
 from caneflow.runtime.dataflow.yaml_shape import ENDPOINT_PATTERN
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.wording import did_you_mean, listed
+
+DEFAULT_KEYS = Path("keys")  # the folder with an observer's certificate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,7 @@ from caneflow.printable import printable
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.launcher.run_directory import RunningFlow, refused_addresses, running_flows
 from caneflow.runtime.hosts.links.session import open_session, sent_at
+from caneflow.runtime.site import DEFAULT_KEYS
 from caneflow.runtime.wording import did_you_mean, listed
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ ANSWER_TIMEOUT = 2.0  # s that a launcher has to answer; it takes some ms
 ASK_AGAIN = 0.1  # s: what a launcher declares may come a moment after the link to it
 WRITE_TIMEOUT = 30.0  # s that a sink has to answer: it may have to write much first
 ANY = "*"
-DEFAULT_KEYS = Path("keys")  # the folder with an observer's certificate
 
 
 class Heard(NamedTuple):

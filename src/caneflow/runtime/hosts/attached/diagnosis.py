@@ -20,7 +20,6 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.attached.attach import (
     ANSWER_TIMEOUT,
     ANY,
-    DEFAULT_KEYS,
     endpoint_of,
     link_settings,
     timed_statuses,
@@ -29,6 +28,7 @@ from caneflow.runtime.hosts.attached.way_to import Finding, way_to
 from caneflow.runtime.hosts.launcher.node_statistics import OLD, OTHER_CLOCK
 from caneflow.runtime.hosts.launcher.run_directory import running_flows
 from caneflow.runtime.hosts.links.session import UNIX, open_session
+from caneflow.runtime.site import DEFAULT_KEYS
 from caneflow.runtime.wording import listed, one_line
 
 CLOCK_TOLERANCE = 0.005  # s between two machines; ages and latencies between them are off by it

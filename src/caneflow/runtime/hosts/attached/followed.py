@@ -6,52 +6,19 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
 
-from caneflow.messages import SAMPLES, Sample, stream_of
+from caneflow.messages import SAMPLES, stream_of
 from caneflow.messages.control import FlowStatus
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attached.attach import ANY, DEFAULT_KEYS, Attached, Heard, attached
+from caneflow.runtime.hosts.attached.attach import ANY, Attached, Heard, attached
+from caneflow.runtime.hosts.attached.flow_events import Began, Came, Ended, Event, Told
 from caneflow.runtime.hosts.launcher.run_directory import running_flows
+from caneflow.runtime.site import DEFAULT_KEYS
 
 MOST_WAITING = 20_000  # samples that this process may be behind; what comes beyond is left out here, and counted
 STATUS_PERIOD = 1.0  # s between two questions to the launchers
 LOOK_PERIOD = 0.2  # s between two looks at what was said, while no sample comes
 SEARCH_PERIOD = 0.5  # s between two looks for a flow that is to come back
-
-
-class Began(NamedTuple):
-    """The flow was found, for the first time or again."""
-
-    flow: str
-    status: FlowStatus
-
-
-class Came(NamedTuple):
-    """A sample of it."""
-
-    node: str
-    port: str
-    kind: type[Sample] | None  # None: no message that this process knows
-    schema: str  # its name; "": the writer did not say
-    payload: bytes
-    received: int  # ns
-
-
-class Told(NamedTuple):
-    """How it is, once a second."""
-
-    status: FlowStatus
-    unheard: int  # samples that this process had no room for, since it began
-
-
-class Ended(NamedTuple):
-    """It answers no more."""
-
-    flow: str
-
-
-Event: TypeAlias = Began | Came | Told | Ended
 
 
 def followed(flow: str | None, at: str | None = None, keys: Path = DEFAULT_KEYS) -> Generator[Event, None, None]:

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Literal
 
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attached.attach import DEFAULT_KEYS, observer_credentials
+from caneflow.runtime.hosts.attached.attach import observer_credentials
 from caneflow.runtime.hosts.links.session import UNIX
+from caneflow.runtime.site import DEFAULT_KEYS
 
 DIAL_TIMEOUT = 2.0  # s that a port may take to accept
 REFUSAL_TIME = 0.5  # s that a TLS server takes to refuse a certificate: it says so after the handshake
