@@ -7,13 +7,13 @@ import pytest
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
+from caneflow.physics import LOCAL_GRAVITY
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.imu import (
     ACCEL_STEP,
     EARTH_FIELD,
     GYRO_STEP,
-    LOCAL_GRAVITY,
     MAG_STEP,
     QUATERNION_STEP,
     ImuSamples,

@@ -7,6 +7,7 @@ import pytest
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
+from caneflow.physics import LOCAL_GRAVITY
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.belt_imu import (
     ACCEL_STEP,
@@ -17,7 +18,6 @@ from caneflow.simulation.belt_imu import (
     measure,
     room_field,
 )
-from caneflow.simulation.imu import LOCAL_GRAVITY
 from caneflow.simulation.room_course import (
     RATE,
     CourseSettings,

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from caneflow.errors import CaneflowError
 from caneflow.messages import Imu, RadarFrame, Sample
+from caneflow.physics import LOCAL_GRAVITY
 from caneflow.protocols import bno055_emulator, mrm, mrm_emulator
 from caneflow.protocols.bno055 import Measurement, registers
 from caneflow.protocols.errors import ProtocolError
@@ -33,7 +34,6 @@ from caneflow.protocols.mrm_scans import (
     split_scan,
 )
 from caneflow.recording import Recording
-from caneflow.simulation.imu import LOCAL_GRAVITY
 
 MCAP = b"\x89MCAP"  # how a recording begins; a log begins with a configuration block
 LONGEST_WAIT = 0.5  # s

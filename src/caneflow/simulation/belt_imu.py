@@ -11,9 +11,10 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.random import Generator
 
+from caneflow.physics import LOCAL_GRAVITY
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
-from caneflow.simulation.imu import LOCAL_GRAVITY, SAMPLE_RATE, ImuSettings, magnetic_field
+from caneflow.simulation.imu import SAMPLE_RATE, ImuSettings, magnetic_field
 from caneflow.simulation.room_course import RATE
 from caneflow.simulation.room_walk import Gait
 

@@ -15,7 +15,6 @@ from annotated_types import Ge, Gt
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.ndimage import spline_filter1d
-from scipy.signal import butter, sosfilt
 
 from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.simulation.attitude import DEGREE, Floats
@@ -190,6 +189,8 @@ def receive(
             received.real * np.sqrt(unit.gain_ratio),
             (received * np.exp(1j * unit.phase_error)).imag / np.sqrt(unit.gain_ratio),
         ]
+    from scipy.signal import butter, sosfilt  # here: it takes a second to import, and walks outdoors need none
+
     filters = butter(2, settings.band, "bandpass", fs=settings.sample_rate, output="sos")
     steps = 2 ** (settings.bits - 1)
     codes = []

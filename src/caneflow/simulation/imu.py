@@ -4,6 +4,7 @@ Data sheet: Bosch BST-BNO055-DS000-14. The rows marked cane.md are what is left 
 """
 
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -11,13 +12,11 @@ from annotated_types import Ge, Gt
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
+from caneflow.physics import LOCAL_GRAVITY
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
 from caneflow.simulation.walk import RATE, Motion
-
-LOCAL_GRAVITY = 9.81  # m/s^2, of the place that is simulated, as wire.md has it; estimators assume physics.GRAVITY
 
 NotNegative = Annotated[float, Ge(0)]
 
@@ -143,14 +142,21 @@ def _fusion(orientation: Floats, field: Floats, turning_error: Floats, settings:
     compass_error = np.arctan2(field[:, 0], field[:, 1])
     kept = np.exp(-1.0 / SAMPLE_RATE / settings.heading_time)
     pushed = (1.0 - kept) * compass_error + turning_error / SAMPLE_RATE
-    heading_error = lfilter([1.0], [1.0, -kept], pushed, zi=[kept * compass_error[0]])[0]
+    heading_error = _leaky_sum(pushed, kept, compass_error[0])
 
     kept = np.exp(-1.0 / SAMPLE_RATE / settings.tilt_time)
     pushes = settings.tilt_error * rng.normal(0.0, 1.0, (len(orientation) + 1, 2))
-    tilt_error = lfilter([1.0], [1.0, -kept], pushes[1:] * np.sqrt(1.0 - kept**2), axis=0, zi=kept * pushes[:1])[0]
-    error = np.column_stack([tilt_error, heading_error])
+    steps = pushes[1:] * np.sqrt(1.0 - kept**2)
+    tilt_errors = [_leaky_sum(steps[:, axis], kept, pushes[0, axis]) for axis in (0, 1)]
+    error = np.column_stack([*tilt_errors, heading_error])
     # small angles about the world's axes: their order changes them by less than 0.05 deg
     return attitude.multiply(attitude.from_rotation_vector(error), orientation)
+
+
+def _leaky_sum(steps: Floats, kept: float, begin: float) -> Floats:
+    """x[k] = kept x[k-1] + steps[k], from x[-1] = begin; (n,), as scipy.signal, which takes a second to import."""
+    sums = accumulate(steps.tolist(), lambda before, step: kept * before + step, initial=float(begin))
+    return np.array(list(sums)[1:])
 
 
 def _calibration(field: Floats) -> NDArray[np.int64]:

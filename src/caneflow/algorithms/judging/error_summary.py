@@ -7,7 +7,6 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv  # chi-square quantiles: scipy.stats takes half a second to import
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -64,6 +63,8 @@ def normalized_error_squared(error: Floats, covariance: Floats) -> float | None:
 
 def consistent_mean(walks: int, *, degrees: int = HORIZONTAL, probability: float = 0.95) -> tuple[float, float]:
     """The interval in which the mean NEES of so many independent walks lies, when their covariances are right."""
+    from scipy.special import gammaincinv  # here: it takes a third of a second to import; scipy.stats, a second
+
     tail = 0.5 * (1.0 - probability)
     low, high = (2.0 * float(gammaincinv(0.5 * walks * degrees, part)) for part in (tail, 1.0 - tail))
     return low / walks, high / walks

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from caneflow.physics import SPEED_OF_LIGHT
 
@@ -109,6 +108,10 @@ def _carrier_of(pairs: Floats) -> ReceivedCarrier | None:
 
 def echoes(scans: NDArray[np.number], times: Floats, usual: float, range_step: float) -> list[tuple[float, float]]:
     """Doppler frequency (Hz) and speed (m/s) of the strongest echoes of one window of scans `usual` s apart."""
+    from scipy import (
+        fft,  # here: a replay asks the P440's driver for its ports alone, and this takes a third of a second
+    )
+
     frequencies = fft.rfftfreq(scans.shape[1], 2.0 * range_step / SPEED_OF_LIGHT)
     inside = (frequencies > BAND[0]) & (frequencies < BAND[1])
     if np.count_nonzero(inside) < LEAST_LINES:
@@ -146,6 +149,8 @@ def echoes(scans: NDArray[np.number], times: Floats, usual: float, range_step: f
 
 def _speed(echo: Floats, frequency: float, period: float, range_step: float) -> float | None:
     """Speed (m/s) that fits all lines of an echo's spectrum best, near what `frequency` says; None: no single one."""
+    from scipy import fft
+
     spectrum = fft.rfft(echo * np.hanning(echo.shape[1]), TRANSFORM, axis=1)
     lines = fft.rfftfreq(TRANSFORM, 2.0 * range_step / SPEED_OF_LIGHT)
     inside = (lines > BAND[0]) & (lines < BAND[1])
