@@ -243,10 +243,16 @@ def test_the_canes_own_graph_is_sound() -> None:
     assert graph.rig["boresight"] == [0, 1, 0]
 
 
-def test_the_checks_need_neither_zenoh_nor_scipy() -> None:
-    code = (
-        "import sys, caneflow.runtime.dataflow.loading; print({'scipy', 'zenoh', 'typer'} & set(sys.modules) or 'none')"
-    )
+@pytest.mark.parametrize(
+    ("modules", "heavy"),
+    [
+        ("runtime.dataflow.loading", {"scipy", "zenoh", "typer"}),
+        ("tools.run, caneflow.drivers.p440, caneflow.tools.emulate, caneflow.tools.evaluate", {"scipy", "matplotlib"}),
+        ("tools.simulate", {"scipy.signal", "scipy.stats", "matplotlib"}),  # a second
+    ],
+)
+def test_nobody_waits_for_what_is_not_needed(modules: str, heavy: set[str]) -> None:
+    code = f"import sys, caneflow.{modules}; print({heavy!r} & set(sys.modules) or 'none')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert done.stdout.strip() == "none"

@@ -13,6 +13,8 @@ import pytest
 from caneflow import dispatch
 from caneflow.messages import Pose, decode, numbered
 from caneflow.recording import Platform, Recording, RecordingWriter
+from caneflow.runtime.dataflow.loading import load
+from caneflow.runtime.replays.verification import verify
 from tests.flows import CANEFLOW, write_walk
 
 FLOW = """
@@ -111,9 +113,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, unpinned: dict[str, str])
     return flow, out
 
 
-def verified(flow: Path, recording: Path, environment: dict[str, str], *more: str) -> tuple[int, dict[str, object]]:
+def verified(flow: Path, recording: Path, environment: dict[str, str]) -> tuple[int, dict[str, object]]:
     done = subprocess.run(
-        [*CANEFLOW, "verify", str(flow), str(recording), "--json", *more],
+        [*CANEFLOW, "verify", str(flow), str(recording), "--json"],
         env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode in (0, 1), done.stderr
@@ -129,10 +131,8 @@ def test_a_recording_says_on_what_it_was_computed(recorded: tuple[Path, Path]) -
 @pytest.mark.parametrize(
     "other",
     [
-        {"NPY_DISABLE_CPU_FEATURES": "X86_V3"},
-        {"NPY_ENABLE_CPU_FEATURES": "X86_V3"},
-        {"OPENBLAS_CORETYPE": "Prescott"},
-        {"OPENBLAS_CORETYPE": "Haswell"},
+        {"NPY_DISABLE_CPU_FEATURES": "X86_V3", "OPENBLAS_CORETYPE": "Prescott"},
+        {"NPY_ENABLE_CPU_FEATURES": "X86_V3", "OPENBLAS_CORETYPE": "Haswell"},
         {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-AVX,-FMA"},
     ],
     ids=lambda other: " ".join(f"{key}={value}" for key, value in other.items()),
@@ -166,25 +166,24 @@ def copied(recording: Path, to: Path, computed_on: Platform, x_off: float, patch
 
 
 @pytest.mark.parametrize(
-    ("other", "x_off", "more", "status"),
+    ("other", "x_off", "tolerance", "holds"),
     [
-        ({"machine": "riscv64"}, 1e-7, (), 0),  # within what is stated for another platform
-        ({"numpy": "1.26.4"}, 1e-7, (), 0),
-        ({"pinned": ("blas", "mathematics")}, 1e-7, (), 0),
-        ({"machine": "riscv64"}, 1e-3, (), 1),  # beyond it
-        ({"machine": "riscv64"}, 1e-7, ("--tolerance", "0"), 1),  # what is asked for goes before what is stated
-        ({"machine": "riscv64"}, 1e-3, ("--tolerance", "0.01"), 0),
-        ({}, 1e-7, (), 1),  # the same platform: equal bytes
+        ({"machine": "riscv64"}, 1e-7, None, True),  # within what is stated for another platform
+        ({"numpy": "1.26.4"}, 1e-7, None, True),
+        ({"pinned": ("blas", "mathematics")}, 1e-7, None, True),
+        ({"machine": "riscv64"}, 1e-3, None, False),  # beyond it
+        ({"machine": "riscv64"}, 1e-7, 0.0, False),  # what is asked for goes before what is stated
+        ({"machine": "riscv64"}, 1e-3, 0.01, True),
+        ({}, 1e-7, None, False),  # the same platform: equal bytes
     ],
 )
 def test_another_platform_is_named_and_compared_within_the_stated_tolerance(
     other: dict[str, str | tuple[str, ...]],
     x_off: float,
-    more: tuple[str, ...],
-    status: int,
+    tolerance: float | None,
+    holds: bool,
     recorded: tuple[Path, Path],
     tmp_path: Path,
-    unpinned: dict[str, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     flow, recording = recorded
@@ -193,25 +192,25 @@ def test_another_platform_is_named_and_compared_within_the_stated_tolerance(
     assert here is not None
     there = msgspec.structs.replace(here, **other)
     changed = copied(recording, tmp_path / "changed.mcap", there, x_off, monkeypatch)
-    found, about = verified(flow, changed, unpinned, *more)
-    assert found == status
-    named = about["platform_differences"]
-    assert isinstance(named, list)
+    monkeypatch.setattr(Platform, "here", lambda: here)
+    verification = verify(load(flow), changed, tolerance=tolerance)
+    assert verification.holds == holds
+    named = verification.differences
     assert len(named) == len(other)
     assert all(any(name in line or "kernels" in line for line in named) for name in other)
 
 
 def test_a_recording_that_does_not_say_is_compared_within_the_stated_tolerance(
-    recorded: tuple[Path, Path], tmp_path: Path, unpinned: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    recorded: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flow, recording = recorded
     with Recording(recording) as source:
         here = source.platform
     assert here is not None
     unsaid = msgspec.structs.replace(here, machine="\x1b")  # which nobody believes
-    status, about = verified(flow, copied(recording, tmp_path / "old.mcap", unsaid, 1e-7, monkeypatch), unpinned)
-    assert status == 0
-    assert about["platform_differences"] == ["the recording does not say on what it was computed"]
+    verification = verify(load(flow), copied(recording, tmp_path / "old.mcap", unsaid, 1e-7, monkeypatch))
+    assert verification.holds
+    assert verification.differences == ["the recording does not say on what it was computed"]
 
 
 @pytest.mark.parametrize(
