@@ -387,6 +387,7 @@ OUTPUTS: dict[tuple[str, str], list[object]] = {
     ("recover", "output"): ["recover", "REC", "-o", "OUT"],
     ("import p440", "output"): ["import", "p440", "LOG", "-o", "OUT"],
     ("import imu-csv", "output"): ["import", "imu-csv", "LOG", "--columns", "time=t,gyro_x=x", "-o", "OUT"],
+    ("import a121", "output"): ["import", "a121", "LOG", "-o", "OUT"],
     ("import wav", "output"): ["import", "wav", "LOG", "-o", "OUT"],
     ("export", "output"): ["export", "REC", "--format", "csv", "--stream", "imu/imu", "-o", "OUT"],
     ("eval", "csv_file"): ["eval", "REC", "--flow", "YAML", "--csv", "OUT"],

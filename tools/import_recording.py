@@ -174,4 +174,10 @@ def _losses(parsed: Log) -> str:
     return ", ".join(parts)
 
 
-commands = {"p440": p440, "imu-csv": "import_imu_csv", "wav": "import_wav", "rosbag": "import_rosbag"}
+commands = {
+    "p440": p440,
+    "a121": "import_a121",
+    "imu-csv": "import_imu_csv",
+    "wav": "import_wav",
+    "rosbag": "import_rosbag",
+}
