@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, Readings
+from caneflow.algorithms.glitches import GlitchGate, GlitchSettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import require_later
 from caneflow.algorithms.radar.ego_motion import (
     AntennaVelocity,
@@ -66,7 +67,7 @@ class EgoVelocityOperator(Operator):
             raise Refused(str(error)) from error
         self._imu_ns = imu.stamp
         gyro, accel, _, orientation, _ = self._gate.update(
-            imu.stamp, Readings(imu.gyro, imu.accel, None, imu.orientation, None)
+            imu.stamp, ImuReading(imu.gyro, imu.accel, orientation=imu.orientation)
         )
         if orientation is not None:
             self._motion.imu(imu.stamp, orientation, gyro, accel)

@@ -19,7 +19,8 @@ from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
 from caneflow.algorithms.cane.speed_gate import CaneGlitchSettings, SpeedGate
 from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettings
 from caneflow.algorithms.cane.zero_velocity import ZeroVelocity, ZeroVelocitySettings
-from caneflow.algorithms.glitches import GlitchGate, Readings
+from caneflow.algorithms.glitches import GlitchGate
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import (
     require_later,
     required_acceleration,
@@ -109,20 +110,18 @@ class Fusion(Operator):
             self._held += (what,)
 
     def _pose(self, imu: Imu) -> Pose:
+        reading = ImuReading(
+            gyro=imu.gyro, accel=imu.accel, mag=imu.mag, orientation=imu.orientation, linear_accel=imu.linear_accel
+        )
         try:
-            self._require(imu)
+            self._require(imu.stamp, reading)
         except ValueError as error:
             raise Refused(str(error)) from error
-        readings = Readings(imu.gyro, imu.accel, imu.mag, imu.orientation, imu.linear_accel)
         if not self._estimator.has_gates:
-            readings = self._gate.update(imu.stamp, readings)
+            reading = self._gate.update(imu.stamp, reading)
             if self._samples < 2:
                 self._begin()
-        if readings.mag is not None:
-            self._estimator.magnetic_field(readings.mag)
-        estimate = self._estimator.imu(
-            imu.stamp, readings.gyro, readings.accel, readings.orientation, readings.linear_accel
-        )
+        estimate = self._estimator.imu(imu.stamp, reading)
         held = self._estimator.held if self._estimator.has_gates else self._gate.held + self._held
         self._held = ()
         return Pose(
@@ -135,16 +134,16 @@ class Fusion(Operator):
             status=" ".join([f"held:{what}" for what in held]) if held else None,
         )
 
-    def _require(self, imu: Imu) -> None:
+    def _require(self, stamp_ns: int, reading: ImuReading) -> None:
         """Raise ValueError for a sample that the method cannot use, before it has changed anything."""
-        require_later(imu.stamp, self._last_ns)
+        require_later(stamp_ns, self._last_ns)
         if self._method == "zero_velocity":
-            required_force(imu.accel, self._method)
+            required_force(reading.accel, self._method)
         else:
-            required_orientation(imu.orientation, self._method)
+            required_orientation(reading.orientation, self._method)
         if self._method not in ("shs", "zero_velocity"):
-            required_acceleration(imu.accel, imu.linear_accel, self._method)
-        self._last_ns = imu.stamp
+            required_acceleration(reading, self._method)
+        self._last_ns = stamp_ns
 
     def _begin(self) -> None:
         """A walk begins at the first sample that the next one agrees with: one that does not is forgotten."""

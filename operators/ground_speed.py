@@ -9,7 +9,8 @@ import math
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 
-from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, Readings
+from caneflow.algorithms.glitches import GlitchGate, GlitchSettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
 from caneflow.algorithms.inertial.imu_sample import require_later
 from caneflow.algorithms.radar.footprint import CaneGeometry
@@ -77,7 +78,7 @@ class GroundSpeedOperator(Operator):
             raise Refused(str(error)) from error
         self._last_ns = imu.stamp
         gyro, accel, _, orientation, _ = self._gate.update(
-            imu.stamp, Readings(imu.gyro, imu.accel, None, imu.orientation, None)
+            imu.stamp, ImuReading(imu.gyro, imu.accel, orientation=imu.orientation)
         )
         if orientation is not None:
             self._attitudes.add(imu.stamp, orientation, gyro)

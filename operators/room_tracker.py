@@ -19,7 +19,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, JumpGate, Readings
+from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, JumpGate
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import heading_of
 from caneflow.algorithms.inertial.standing import StandingDetector, StandingSettings
 from caneflow.algorithms.quantities import Component, Length, Time, Zero
@@ -158,7 +159,9 @@ class RoomTrackerOperator(Operator):
 
     def _take_heading(self, imu: Imu) -> None:
         assert imu.orientation is not None
-        read = self._imu_gate.update(imu.stamp, Readings(imu.gyro, None, None, imu.orientation, imu.linear_accel))
+        read = self._imu_gate.update(
+            imu.stamp, ImuReading(imu.gyro, orientation=imu.orientation, linear_accel=imu.linear_accel)
+        )
         self._news.update(dict.fromkeys(f"held:{part}" for part in self._imu_gate.held))
         assert read.orientation is not None
         self._facing = read.orientation
@@ -175,7 +178,7 @@ class RoomTrackerOperator(Operator):
             self._news["held:cane"] = None
         self._tracker.walked(pose.stamp, place)
 
-    def _stands(self, stamp: int, read: Readings) -> bool | None:
+    def _stands(self, stamp: int, read: ImuReading) -> bool | None:
         """Whether the wearer stands; None without an accelerometer."""
         if read.linear_accel is None:
             return None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings, level_covariance
 from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,
@@ -94,9 +95,8 @@ def run(
         north = 0.0 if walk.north is None else float(walk.north[index])
         if speed_first:
             radar()
-        if mag:
-            cane.magnetic_field(rotate(inverse, (-20.0 * math.sin(north), 20.0 * math.cos(north), -40.0)))
-        estimates.append(cane.imu(stamp_ns, gyro, accel, body, None))
+        field = rotate(inverse, (-20.0 * math.sin(north), 20.0 * math.cos(north), -40.0)) if mag else None
+        estimates.append(cane.imu(stamp_ns, ImuReading(gyro, accel, field, orientation=body)))
         if not speed_first:
             radar()
     return cane, estimates
@@ -231,7 +231,7 @@ def test_velocities_that_come_more_often_are_worth_less_each() -> None:
         for index in range(len(walk.yaws)):
             stamp_ns = START_NS + index * PERIOD_NS
             accel = rotate(conjugate(held(0.0)), (0.0, 0.0, GRAVITY))
-            estimate = cane.imu(stamp_ns, (0.0, 0.0, 0.0), accel, held(0.0), None)
+            estimate = cane.imu(stamp_ns, ImuReading((0.0, 0.0, 0.0), accel, orientation=held(0.0)))
             if index % every == 0:
                 cane.velocity(stamp_ns, (0.5, 0.0), (0.0025, 0.0, UNOBSERVED), 0.025)
         assert estimate.covariance is not None
@@ -273,9 +273,9 @@ def test_the_order_of_delivery_of_one_stamp_does_not_matter() -> None:
 def test_what_is_missing_is_named() -> None:
     cane = CaneFilter(CaneFilterSettings(), boresight=BORESIGHT)
     with pytest.raises(ValueError, match="best: the imu sample has no orientation"):
-        cane.imu(START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), None, None)
+        cane.imu(START_NS, ImuReading((0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY)))
     with pytest.raises(ValueError, match="neither linear_accel nor accel"):
-        cane.imu(START_NS, (0.0, 0.0, 0.0), None, held(0.0), None)
+        cane.imu(START_NS, ImuReading((0.0, 0.0, 0.0), orientation=held(0.0)))
 
 
 def test_covariance_is_turned_and_takes_in_heading_and_scale() -> None:
@@ -302,11 +302,11 @@ def test_a_filter_that_disagrees_with_the_radar_for_a_second_believes_it_again()
     for index in range(1000):
         stamp_ns = START_NS + index * PERIOD_NS
         if index == 400:
-            before = cane.imu(stamp_ns, (0.0, 0.0, 0.0), at_rest, body, None)
+            before = cane.imu(stamp_ns, ImuReading((0.0, 0.0, 0.0), at_rest, orientation=body))
             cane._motion._x[2] = 20.0
             cane._motion._p[2:4, :] = cane._motion._p[:, 2:4] = 0.0
             continue
-        estimate = cane.imu(stamp_ns, (0.0, 0.0, 0.0), at_rest, body, None)
+        estimate = cane.imu(stamp_ns, ImuReading((0.0, 0.0, 0.0), at_rest, orientation=body))
         if index % 5 == 0:
             cane.velocity(stamp_ns, (0.5 + 0.03 * rng.normal(), 0.0), (0.0009, 0.0, UNOBSERVED), 0.0)
         if index == 550:
@@ -322,6 +322,6 @@ def test_a_stated_error_of_nothing_is_not_believed() -> None:
     for index in range(60):
         if index % 5 == 0:
             cane.velocity(START_NS + index * PERIOD_NS, (0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
-        estimate = cane.imu(START_NS + index * PERIOD_NS, (0.0, 0.0, 0.0), force, body, None)
+        estimate = cane.imu(START_NS + index * PERIOD_NS, ImuReading((0.0, 0.0, 0.0), force, orientation=body))
     assert estimate.covariance is not None
     assert 0.004**2 < estimate.covariance[3, 3] < 0.02**2

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings
 from caneflow.algorithms.cane.cane_smoother import CaneSmoother
 from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.attitude_history import AttitudeHistory
 from caneflow.algorithms.judging.track_errors import Track, TrackErrors, boresight_yaws, track_errors
 from caneflow.algorithms.radar.footprint import CaneGeometry
@@ -125,9 +126,10 @@ def velocities(inputs: Inputs, settings: GroundVelocitySettings | None = None) -
 def feed(estimator: CaneFilter | CaneSmoother, inputs: Inputs) -> list[PoseEstimate | None]:
     estimates: list[PoseEstimate | None] = []
     for index, (stamp_ns, seen) in enumerate(zip(inputs.stamps, velocities(inputs), strict=True)):
-        estimator.magnetic_field(inputs.mag[index])
-        sample = (inputs.gyro[index], inputs.accel[index], inputs.orientation[index], None)
-        estimates.append(estimator.imu(stamp_ns, *sample))
+        reading = ImuReading(
+            inputs.gyro[index], inputs.accel[index], inputs.mag[index], orientation=inputs.orientation[index]
+        )
+        estimates.append(estimator.imu(stamp_ns, reading))
         if seen is not None:
             estimator.velocity(stamp_ns, seen.velocity, seen.covariance, seen.delay)
     return estimates

@@ -17,6 +17,7 @@ from caneflow.algorithms.cane.kalman import KalmanFilter, KalmanSettings
 from caneflow.algorithms.cane.luenberger import LuenbergerObserver, LuenbergerSettings
 from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
 from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import SampleClock, heading_of
 from caneflow.algorithms.judging.track_errors import Track, TrackErrors, boresight_yaws, track_errors
 
@@ -71,10 +72,12 @@ def followed(walk: str, name: str) -> TrackErrors:
         estimates.append(
             reckoning.imu(
                 imu["stamp"],
-                tuple(imu["gyro"]),
-                tuple(imu["accel"]),
-                tuple(imu["orientation"]),
-                tuple(imu["linear_accel"]),
+                ImuReading(
+                    tuple(imu["gyro"]),
+                    tuple(imu["accel"]),
+                    orientation=tuple(imu["orientation"]),
+                    linear_accel=tuple(imu["linear_accel"]),
+                ),
             )
         )
     assert reckoning.gaps == 0
@@ -117,10 +120,13 @@ def test_the_first_estimate_is_the_origin_and_every_sample_gives_one(name: str) 
     reckoning = method(name)
     orientation = rotations.from_yaw(0.3)
     reckoning.speed(999, 0.5, 0.1, True, 0.3)
-    first = reckoning.imu(1_000, STILL, STILL, orientation, STILL)
+    first = reckoning.imu(1_000, ImuReading(STILL, STILL, orientation=orientation, linear_accel=STILL))
     assert first.position == first.velocity == STILL
     assert first.orientation == orientation
-    assert reckoning.imu(2_000, STILL, STILL, orientation, STILL).orientation == orientation
+    assert (
+        reckoning.imu(2_000, ImuReading(STILL, STILL, orientation=orientation, linear_accel=STILL)).orientation
+        == orientation
+    )
 
 
 def test_the_clock_measures_intervals_and_counts_gaps() -> None:

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, JumpGate, Readings
+from caneflow.algorithms.glitches import GlitchGate, GlitchSettings, JumpGate
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import Vector, from_yaw
 
 PERIOD_NS = 10_000_000
@@ -48,11 +49,11 @@ def test_a_wild_reading_at_the_start_holds_up_none_of_the_good_ones(at: int) -> 
 
 def test_each_part_of_a_sample_has_its_own_gate() -> None:
     gate = GlitchGate(GlitchSettings())
-    good = Readings((0.1, 0.0, 0.0), (0.0, 0.0, 9.8), (20.0, 0.0, -40.0), from_yaw(0.5), (0.0, 0.1, 0.0))
-    wild = Readings((35.7, 0.0, 0.0), (0.0, 0.0, -327.68), (20.0, 900.0, -40.0), from_yaw(0.9), (0.0, 99.0, 0.0))
+    good = ImuReading((0.1, 0.0, 0.0), (0.0, 0.0, 9.8), (20.0, 0.0, -40.0), from_yaw(0.5), (0.0, 0.1, 0.0))
+    wild = ImuReading((35.7, 0.0, 0.0), (0.0, 0.0, -327.68), (20.0, 900.0, -40.0), from_yaw(0.9), (0.0, 99.0, 0.0))
     for index in range(3):
         assert gate.update(index * PERIOD_NS, good) == good
-    for index, part in enumerate(Readings._fields, 3):
+    for index, part in enumerate(ImuReading._fields, 3):
         spoilt = good._replace(**{part: getattr(wild, part)})
         assert gate.update(2 * index * PERIOD_NS, spoilt) == good
         assert list(gate.held) == [part]
@@ -65,13 +66,13 @@ def test_an_attitude_and_its_negative_are_the_same() -> None:
     one = from_yaw(0.5)
     other = tuple(-each for each in one)
     for index, orientation in enumerate((one, one, other, one)):
-        gate.update(index * PERIOD_NS, Readings(REST, None, None, orientation, None))  # type: ignore[arg-type] # four
+        gate.update(index * PERIOD_NS, ImuReading(REST, orientation=orientation))  # type: ignore[arg-type] # four
         assert not gate.held
 
 
 def test_a_sensor_without_a_part_keeps_being_without() -> None:
     gate = GlitchGate(GlitchSettings())
-    bare = Readings(REST, None, None, None, None)
+    bare = ImuReading(REST)
     assert [gate.update(index * PERIOD_NS, bare) for index in range(3)] == [bare] * 3
 
 
@@ -95,8 +96,8 @@ def test_the_second_of_two_that_differ_says_so_while_neither_is_confirmed() -> N
 
 def test_a_sensor_that_begins_with_its_full_scale_is_held_at_rest() -> None:
     gate = GlitchGate(GlitchSettings())
-    first = Readings((35.7, 0.0, 0.0), WILD, None, None, WILD)
-    assert gate.update(0, first) == Readings(REST, (0.0, 0.0, 9.80665), None, None, REST)
-    turned = Readings((0.1, 0.0, 0.0), (9.8, 0.0, 0.0), None, None, REST)
+    first = ImuReading((35.7, 0.0, 0.0), WILD, linear_accel=WILD)
+    assert gate.update(0, first) == ImuReading(REST, (0.0, 0.0, 9.80665), linear_accel=REST)
+    turned = ImuReading((0.1, 0.0, 0.0), (9.8, 0.0, 0.0), linear_accel=REST)
     assert gate.update(PERIOD_NS, turned) == turned
     assert not gate.held

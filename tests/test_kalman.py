@@ -17,6 +17,7 @@ from caneflow.algorithms.cane.kalman import (
     KalmanSettings,
     SlowError,
 )
+from caneflow.algorithms.imu_reading import ImuReading
 
 Vector = rotations.Vector
 Floats = NDArray[np.float64]
@@ -86,7 +87,7 @@ def test_agrees_with_the_textbook_for_uneven_intervals_and_missing_speeds(seed: 
         if speed is not None:
             kalman.speed(stamps[k], speed, 0.1, True, None)
         body = rotations.rotate(rotations.conjugate(orientation), accels[k])
-        estimate = kalman.imu(stamps[k], STILL, None, orientation, body)
+        estimate = kalman.imu(stamps[k], ImuReading(STILL, orientation=orientation, linear_accel=body))
         assert [*kalman.acceleration, *estimate.velocity, *estimate.position] == pytest.approx(
             states[k].tolist(), abs=1e-9
         )
@@ -104,7 +105,9 @@ def test_the_covariance_stays_symmetric_and_positive_definite_through_a_walk() -
         if rng.random() < 0.7:
             kalman.speed(stamp, float(rng.uniform(0, 1.5)), float(rng.exponential(0.1)), rng.random() < 0.9, 0.3)
         x, y, z = rng.normal(0.0, 3.0, 3).tolist()
-        covariance = kalman.imu(stamp, STILL, None, rotations.from_yaw(0.002 * k), (x, y, z)).covariance
+        covariance = kalman.imu(
+            stamp, ImuReading(STILL, orientation=rotations.from_yaw(0.002 * k), linear_accel=(x, y, z))
+        ).covariance
         assert covariance is not None
         assert (covariance == covariance.T).all()
         smallest, *_, largest = np.linalg.eigvalsh(covariance)
@@ -127,7 +130,7 @@ def settled(settings: KalmanSettings) -> KalmanFilter:
     kalman = forward(settings)
     for k in range(1000):
         kalman.speed(START_NS + k * PERIOD_NS, 0.0, 0.0, True, None)
-        kalman.imu(START_NS + k * PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
+        kalman.imu(START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL))
     return kalman
 
 
@@ -143,15 +146,15 @@ def test_the_steady_state_solves_the_riccati_equation(settings: KalmanSettings) 
     # the gain's columns, seen from outside: the answer to one acceleration and to one speed of 1
     stamp = START_NS + 1000 * PERIOD_NS
     kalman.speed(stamp, 0.0, 0.0, True, None)
-    kalman.imu(stamp, STILL, None, rotations.IDENTITY, (1.0, 0.0, 0.0))
+    kalman.imu(stamp, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=(1.0, 0.0, 0.0)))
     kalman.speed(stamp + PERIOD_NS, 0.0, 0.0, True, None)
-    answer = kalman.imu(stamp + PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
+    answer = kalman.imu(stamp + PERIOD_NS, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL))
     assert (kalman.acceleration[0], answer.velocity[0]) == pytest.approx(gain[:, 0].tolist(), rel=1e-6)
 
     kalman = settled(settings)
     kalman.speed(stamp, 1.0, 0.0, True, None)
-    kalman.imu(stamp, STILL, None, rotations.IDENTITY, STILL)
-    answer = kalman.imu(stamp + PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
+    kalman.imu(stamp, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL))
+    answer = kalman.imu(stamp + PERIOD_NS, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL))
     assert (kalman.acceleration[0], answer.velocity[0]) == pytest.approx(gain[:, 1].tolist(), rel=1e-6)
 
 
@@ -177,7 +180,9 @@ def test_where_its_model_holds_the_errors_are_as_large_as_the_covariance_says() 
             orientation = rotations.from_yaw(yaw)
             x, y, z = (a + rng.normal(0.0, PLAIN.acceleration_noise, 3)).tolist()
             body = rotations.rotate(rotations.conjugate(orientation), (x, y, z))
-            estimate = kalman.imu(START_NS + k * PERIOD_NS, STILL, None, orientation, body)
+            estimate = kalman.imu(
+                START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=orientation, linear_accel=body)
+            )
         assert estimate.covariance is not None
         plane = [0, 1, 3, 4]
         error = np.concatenate([np.array(estimate.position) - p, np.array(estimate.velocity) - v])[plane]
@@ -238,7 +243,9 @@ def test_the_slow_errors_are_in_the_covariance_that_is_given_out() -> None:
         kalman = forward(settings)
         for k in range(1001):
             kalman.speed(START_NS + k * PERIOD_NS, 1.0, 0.05, True, None)
-            end = kalman.imu(START_NS + k * PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
+            end = kalman.imu(
+                START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL)
+            )
         assert end.covariance is not None
         ends.append(end.covariance)
     distance = end.position[0]
@@ -255,7 +262,9 @@ def test_noise_from_quality_is_its_scale_times_the_quality_above_the_floor(quali
         kalman = forward(settings)
         for k in range(30):
             kalman.speed(START_NS + k * PERIOD_NS, 1.0, quality, True, None)
-            end = kalman.imu(START_NS + k * PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
+            end = kalman.imu(
+                START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL)
+            )
         ends.append(end.velocity)
     assert ends[0] == pytest.approx(ends[1])
 
@@ -264,7 +273,9 @@ def test_a_speed_of_no_quality_says_nothing() -> None:
     kalman = forward(KalmanSettings(noise_from_quality=True))
     for k in range(30):
         kalman.speed(START_NS + k * PERIOD_NS, 1.0, math.inf, True, None)
-        end = kalman.imu(START_NS + k * PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
+        end = kalman.imu(
+            START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL)
+        )
     assert end.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
     assert end.covariance is not None
     assert np.isfinite(end.covariance).all()
@@ -277,7 +288,7 @@ def test_an_open_path_leads_along_the_boresights_yaw() -> None:
     orientation = rotations.from_yaw(yaw - math.pi / 2)
     for k in range(1001):
         kalman.speed(START_NS + k * PERIOD_NS, 0.8, 0.05, True, 0.32)
-        end = kalman.imu(START_NS + k * PERIOD_NS, STILL, None, orientation, STILL)
+        end = kalman.imu(START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=orientation, linear_accel=STILL))
     assert rotations.yaw_of(end.position) == pytest.approx(yaw)
     # the first samples lean on the initial velocity of 0
     assert math.hypot(end.position[0], end.position[1]) == pytest.approx(8.0, abs=0.1)
@@ -288,8 +299,10 @@ def test_a_gap_is_counted_crossed_with_the_last_velocity_and_admitted_in_the_cov
     last = START_NS + 1000 * PERIOD_NS
     for k in range(300):
         kalman.speed(last + k * PERIOD_NS, 0.6, 0.05, True, None)
-        before = kalman.imu(last + k * PERIOD_NS, STILL, None, rotations.IDENTITY, STILL)
-    after = kalman.imu(last + 299 * PERIOD_NS + 2_000_000_000, STILL, None, rotations.IDENTITY, STILL)
+        before = kalman.imu(last + k * PERIOD_NS, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL))
+    after = kalman.imu(
+        last + 299 * PERIOD_NS + 2_000_000_000, ImuReading(STILL, orientation=rotations.IDENTITY, linear_accel=STILL)
+    )
     assert kalman.gaps == 1
     assert after.position[0] - before.position[0] == pytest.approx(1.2, abs=0.01)
     assert before.covariance is not None
@@ -312,4 +325,4 @@ def test_a_correction_never_adds_variance_and_needs_no_optimal_gain() -> None:
 
 def test_what_is_missing_is_named() -> None:
     with pytest.raises(ValueError, match=r"kalman: the imu sample has no orientation; it needs"):
-        forward(PLAIN).imu(START_NS, STILL, STILL, None, STILL)
+        forward(PLAIN).imu(START_NS, ImuReading(STILL, STILL, linear_accel=STILL))

@@ -15,6 +15,7 @@ from caneflow.algorithms.cane.luenberger import (
     observer_eigenvalues,
     placed_gain,
 )
+from caneflow.algorithms.imu_reading import ImuReading
 
 Vector = rotations.Vector
 BORESIGHT: Vector = (0.0, 1.0, 0.0)
@@ -45,7 +46,7 @@ def walk(observer: LuenbergerObserver, samples: int, speed: float, orientation: 
     for k in range(samples):
         stamp = START_NS + k * PERIOD_NS
         observer.speed(stamp, speed, 0.05, True, 0.32)
-        estimate = observer.imu(stamp, STILL, None, orientation, STILL)
+        estimate = observer.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=STILL))
     return estimate
 
 
@@ -86,7 +87,9 @@ def test_agrees_with_the_matrix_iteration_for_uneven_intervals_and_missing_speed
         orientation = held(yaw)
         if speed is not None:
             observer.speed(stamp, speed, 0.1, True, None)
-        got.append(observer.imu(stamp, STILL, None, orientation, body(orientation, accel)))
+        got.append(
+            observer.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=body(orientation, accel)))
+        )
 
     speeds = [
         None if s is None else (s * math.cos(yaw), s * math.sin(yaw), 0.0) for s, yaw in zip(scalars, yaws, strict=True)
@@ -173,7 +176,9 @@ def test_an_accelerometer_bias_leaks_in_as_bias_times_interval_over_one_minus_po
     for k in range(1000):
         stamp = START_NS + k * PERIOD_NS
         observer.speed(stamp, 0.5, 0.05, True, None)
-        end = observer.imu(stamp, STILL, None, orientation, body(orientation, (0.07, 0.0, 0.0)))
+        end = observer.imu(
+            stamp, ImuReading(STILL, orientation=orientation, linear_accel=body(orientation, (0.07, 0.0, 0.0)))
+        )
     assert end.velocity[0] - 0.5 == pytest.approx(0.07 * 0.01 / (1 - 0.95), rel=1e-6)
 
 
@@ -181,11 +186,14 @@ def test_a_rest_is_a_measurement_of_zero_on_all_three_axes() -> None:
     observer = LuenbergerObserver(LuenbergerSettings(), boresight=BORESIGHT)
     orientation = held(1.0)
     for k in range(50):  # no speed yet: the acceleration is integrated
-        moving = observer.imu(START_NS + k * PERIOD_NS, STILL, None, orientation, body(orientation, (1.0, -1.0, 0.5)))
+        moving = observer.imu(
+            START_NS + k * PERIOD_NS,
+            ImuReading(STILL, orientation=orientation, linear_accel=body(orientation, (1.0, -1.0, 0.5))),
+        )
     assert moving.velocity == pytest.approx((0.48, -0.48, 0.24), abs=0.01)
     for k in range(50, 400):
         observer.speed(START_NS + k * PERIOD_NS, 0.0, 0.0, True, 0.32)
-        resting = observer.imu(START_NS + k * PERIOD_NS, STILL, None, orientation, STILL)
+        resting = observer.imu(START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=orientation, linear_accel=STILL))
     assert resting.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
@@ -194,7 +202,10 @@ def test_a_speed_that_is_not_valid_changes_nothing() -> None:
     for k in range(100):
         stamp = START_NS + k * PERIOD_NS
         observers[0].speed(stamp, 0.0, math.inf, False, 0.32)
-        ends = [observer.imu(stamp, STILL, None, held(0.2), (0.3, 0.0, 0.0)) for observer in observers]
+        ends = [
+            observer.imu(stamp, ImuReading(STILL, orientation=held(0.2), linear_accel=(0.3, 0.0, 0.0)))
+            for observer in observers
+        ]
         assert ends[0] == ends[1]
 
 
@@ -204,7 +215,10 @@ def test_the_order_of_two_samples_with_one_stamp_does_not_matter() -> None:
     for k in range(200):
         stamp, speed, orientation = START_NS + k * PERIOD_NS, float(rng.uniform(0, 1)), held(0.01 * k)
         observers[0].speed(stamp, speed, 0.1, True, 0.32)
-        ends = [observer.imu(stamp, STILL, None, orientation, STILL) for observer in observers]
+        ends = [
+            observer.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=STILL))
+            for observer in observers
+        ]
         observers[1].speed(stamp, speed, 0.1, True, 0.32)
         assert ends[0] == ends[1]
 
@@ -217,10 +231,10 @@ def test_a_gap_is_counted_and_crossed_with_the_last_velocity() -> None:
         stamp = START_NS + k * PERIOD_NS
         observer.speed(stamp, 0.6, 0.05, True, None)
         jerk = body(orientation, (5.0, 0.0, 0.0)) if k >= 490 else STILL
-        before = observer.imu(stamp, STILL, None, orientation, jerk)
+        before = observer.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=jerk))
     assert observer.gaps == 0
     assert observer.acceleration[0] == pytest.approx(5.0, abs=0.02)
-    after = observer.imu(stamp + 2_000_000_000, STILL, None, orientation, STILL)
+    after = observer.imu(stamp + 2_000_000_000, ImuReading(STILL, orientation=orientation, linear_accel=STILL))
     assert observer.gaps == 1
     corrected = 0.95 * before.velocity[0] + 0.05 * 0.6  # by the last speed, as ever
     assert after.velocity[0] == pytest.approx(corrected)
@@ -230,7 +244,7 @@ def test_a_gap_is_counted_and_crossed_with_the_last_velocity() -> None:
 def test_half_a_second_is_not_a_gap_yet() -> None:
     observer = LuenbergerObserver(LuenbergerSettings(), boresight=BORESIGHT)
     for k in range(3):
-        observer.imu(START_NS + k * 500_000_000, STILL, None, held(0.0), STILL)
+        observer.imu(START_NS + k * 500_000_000, ImuReading(STILL, orientation=held(0.0), linear_accel=STILL))
     assert observer.gaps == 0
 
 
@@ -243,7 +257,7 @@ def turning(compensation: DelayCompensation, delay: float) -> PoseEstimate:
         observer.speed(stamp, 1.0, 0.05, True, delay)
         orientation = held(yaw)
         centripetal = body(orientation, (-0.5 * math.sin(yaw), 0.5 * math.cos(yaw), 0.0))
-        estimate = observer.imu(stamp, STILL, None, orientation, centripetal)
+        estimate = observer.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=centripetal))
     return estimate
 
 
@@ -264,7 +278,9 @@ def test_delay_compensation_by_motion_follows_an_acceleration() -> None:
         for k in range(400):
             stamp = START_NS + k * PERIOD_NS
             observer.speed(stamp, max(0.0, 0.01 * k - 0.3), 0.05, True, 0.3)
-            end = observer.imu(stamp, STILL, None, orientation, body(orientation, (1.0, 0.0, 0.0)))
+            end = observer.imu(
+                stamp, ImuReading(STILL, orientation=orientation, linear_accel=body(orientation, (1.0, 0.0, 0.0)))
+            )
         lag[name] = 3.99 - end.velocity[0]
     assert lag["none"] == pytest.approx(0.3, abs=0.01)
     assert lag["motion"] == pytest.approx(0.0, abs=0.01)
@@ -281,10 +297,12 @@ def test_accel_and_gravity_stand_in_for_the_chips_linear_acceleration() -> None:
             specific = body(orientation, (world[0], world[1], world[2] + 9.80665))
             end = observer.imu(
                 START_NS + k * PERIOD_NS,
-                STILL,
-                None if given_by_chip else specific,
-                orientation,
-                linear if given_by_chip else None,
+                ImuReading(
+                    STILL,
+                    None if given_by_chip else specific,
+                    orientation=orientation,
+                    linear_accel=linear if given_by_chip else None,
+                ),
             )
         ends.append(end)
     assert ends[0].position == pytest.approx(ends[1].position, abs=1e-9)
@@ -293,13 +311,13 @@ def test_accel_and_gravity_stand_in_for_the_chips_linear_acceleration() -> None:
 def test_what_is_missing_is_named() -> None:
     observer = LuenbergerObserver(LuenbergerSettings(), boresight=BORESIGHT)
     with pytest.raises(ValueError, match=r"luenberger: the imu sample has no orientation; it needs"):
-        observer.imu(START_NS, STILL, STILL, None, STILL)
+        observer.imu(START_NS, ImuReading(STILL, STILL, linear_accel=STILL))
     with pytest.raises(ValueError, match=r"luenberger: .* neither linear_accel nor accel"):
-        observer.imu(START_NS, STILL, None, held(0.0), None)
+        observer.imu(START_NS, ImuReading(STILL, orientation=held(0.0)))
 
 
 def test_time_that_does_not_go_on_is_refused() -> None:
     observer = LuenbergerObserver(LuenbergerSettings(), boresight=BORESIGHT)
-    observer.imu(START_NS, STILL, None, held(0.0), STILL)
+    observer.imu(START_NS, ImuReading(STILL, orientation=held(0.0), linear_accel=STILL))
     with pytest.raises(ValueError, match="is not after the one before"):
-        observer.imu(START_NS, STILL, None, held(0.0), STILL)
+        observer.imu(START_NS, ImuReading(STILL, orientation=held(0.0), linear_accel=STILL))

@@ -26,6 +26,7 @@ from caneflow.algorithms.cane.luenberger_fixed import (
     quotient,
     rotated,
 )
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import IDENTITY, Quaternion, Vector, from_yaw, multiply, normalized, rotate
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample, decode
 from caneflow.messages.rig import Rig
@@ -136,8 +137,8 @@ def test_agrees_with_the_float_observer_for_uneven_intervals_gaps_and_missing_sp
         for observer in (in_whole_numbers, in_floats):
             if speed is not None:
                 observer.speed(stamp, speed, 0.1, True, 0.13)
-        got = in_whole_numbers.imu(stamp, STILL, None, orientation, acceleration)
-        expected = in_floats.imu(stamp, STILL, None, orientation, acceleration)
+        got = in_whole_numbers.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=acceleration))
+        expected = in_floats.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=acceleration))
         assert got.velocity == pytest.approx(expected.velocity, abs=2e-6)
         assert got.position == pytest.approx(expected.position, abs=1e-4)
         assert not in_whole_numbers.saturated
@@ -148,8 +149,8 @@ def test_specific_force_serves_where_the_chip_gives_no_linear_acceleration() -> 
     whole, floats = both()
     for k in range(50):
         stamp = START_NS + k * PERIOD_NS
-        got = whole.imu(stamp, STILL, (0.3, -0.2, 9.9), IDENTITY, None)
-        expected = floats.imu(stamp, STILL, (0.3, -0.2, 9.9), IDENTITY, None)
+        got = whole.imu(stamp, ImuReading(STILL, (0.3, -0.2, 9.9), orientation=IDENTITY))
+        expected = floats.imu(stamp, ImuReading(STILL, (0.3, -0.2, 9.9), orientation=IDENTITY))
     assert got.velocity == pytest.approx(expected.velocity, abs=1e-6)
 
 
@@ -160,7 +161,7 @@ def test_a_position_loses_nothing_to_rounding() -> None:
     for k in range(2000):
         stamp = START_NS + k * PERIOD_NS
         whole.speed(stamp, 1 / 3, 0.1, True, None)
-        pose = whole.imu(stamp, STILL, None, from_yaw(1.0), STILL)
+        pose = whole.imu(stamp, ImuReading(STILL, orientation=from_yaw(1.0), linear_accel=STILL))
         exact += Fraction(pose.velocity[0]) * PERIOD_NS / 10**9 if k else 0
     assert abs(exact) > 1
     # the interval is right to 2 ** -32 s, each step to 2 ** -37 m
@@ -171,7 +172,7 @@ def test_poses_are_whole_numbers_of_steps() -> None:
     whole, _ = both()
     for stamp, orientation, acceleration, speed in restless(50, seed=1):
         whole.speed(stamp, speed or 0.0, 0.1, speed is not None, None)
-        pose = whole.imu(stamp, STILL, None, orientation, acceleration)
+        pose = whole.imu(stamp, ImuReading(STILL, orientation=orientation, linear_accel=acceleration))
         acceleration_state, velocity, position = whole.states
         assert [each * 2**VELOCITY for each in pose.velocity] == list(velocity)
         assert [each * 2**POSITION for each in pose.position] == list(position)
@@ -180,20 +181,22 @@ def test_poses_are_whole_numbers_of_steps() -> None:
 
 def test_what_leaves_its_format_stays_at_the_end_of_it_and_is_flagged() -> None:
     whole, _ = both()
-    whole.imu(START_NS, STILL, None, IDENTITY, (1e300, 0.0, 0.0))
+    whole.imu(START_NS, ImuReading(STILL, orientation=IDENTITY, linear_accel=(1e300, 0.0, 0.0)))
     assert whole.saturated, "an acceleration beyond 256 m/s^2"
-    whole.imu(START_NS + PERIOD_NS, STILL, None, IDENTITY, STILL)
+    whole.imu(START_NS + PERIOD_NS, ImuReading(STILL, orientation=IDENTITY, linear_accel=STILL))
     assert not whole.saturated, "the flag is of one sample"
     for k in range(2, 200):
-        pose = whole.imu(START_NS + k * PERIOD_NS, STILL, None, IDENTITY, (256.0, 0.0, -256.0))
+        pose = whole.imu(
+            START_NS + k * PERIOD_NS, ImuReading(STILL, orientation=IDENTITY, linear_accel=(256.0, 0.0, -256.0))
+        )
     assert whole.saturated
     assert pose.velocity[0] == LARGEST / 2**VELOCITY
     assert pose.velocity[2] == -LARGEST / 2**VELOCITY
     for k in range(100):
-        pose = whole.imu(START_NS + (k + 1) * 10**12, STILL, None, IDENTITY, STILL)
+        pose = whole.imu(START_NS + (k + 1) * 10**12, ImuReading(STILL, orientation=IDENTITY, linear_accel=STILL))
     assert pose.position[0] == LARGEST / 2**POSITION
     whole.speed(START_NS + 101 * 10**12, -1e9, 0.1, True, -1e9)
-    whole.imu(START_NS + 102 * 10**12, STILL, None, IDENTITY, STILL)
+    whole.imu(START_NS + 102 * 10**12, ImuReading(STILL, orientation=IDENTITY, linear_accel=STILL))
     assert whole.saturated, "a speed beyond 32 m/s, a delay beyond 8 s"
 
 
@@ -207,7 +210,10 @@ def test_states_stay_in_32_bits_whatever_comes(gain: Gain | None) -> None:
         speed, delay, *vector = (rng.normal(0, 1, 5) * 10.0 ** rng.integers(-8, 10, 5)).tolist()
         x, y, z, w = rng.normal(0, 1, 4).tolist()
         whole.speed(stamp, speed, 0.0, bool(rng.random() < 0.5), delay)
-        whole.imu(stamp, STILL, None, normalized((w, x, y, z)), (vector[0], vector[1], vector[2]))
+        whole.imu(
+            stamp,
+            ImuReading(STILL, orientation=normalized((w, x, y, z)), linear_accel=(vector[0], vector[1], vector[2])),
+        )
         assert all(abs(each) <= LARGEST for state in whole.states for each in state)
         flags += whole.saturated
     assert flags > 50
@@ -216,14 +222,14 @@ def test_states_stay_in_32_bits_whatever_comes(gain: Gain | None) -> None:
 def test_what_is_missing_or_wrong_is_said() -> None:
     whole, _ = both()
     with pytest.raises(ValueError, match="luenberger_fixed: the imu sample has no orientation"):
-        whole.imu(START_NS, STILL, None, None, STILL)
+        whole.imu(START_NS, ImuReading(STILL, linear_accel=STILL))
     with pytest.raises(ValueError, match="neither linear_accel nor accel"):
-        whole.imu(START_NS, STILL, None, IDENTITY, None)
+        whole.imu(START_NS, ImuReading(STILL, orientation=IDENTITY))
     with pytest.raises(ValueError, match="its norm is not 1"):
-        whole.imu(START_NS, STILL, None, (1.1, 0.0, 0.0, 0.0), STILL)
-    whole.imu(START_NS, STILL, None, IDENTITY, STILL)
+        whole.imu(START_NS, ImuReading(STILL, orientation=(1.1, 0.0, 0.0, 0.0), linear_accel=STILL))
+    whole.imu(START_NS, ImuReading(STILL, orientation=IDENTITY, linear_accel=STILL))
     with pytest.raises(ValueError, match="is not after the one before"):
-        whole.imu(START_NS, STILL, None, IDENTITY, STILL)
+        whole.imu(START_NS, ImuReading(STILL, orientation=IDENTITY, linear_accel=STILL))
     with pytest.raises(ValueError, match="compensate_delay is motion; in fixed point there are none and heading"):
         observer_constants(LuenbergerSettings(compensate_delay="motion"), BORESIGHT)
     with pytest.raises(ValueError, match="each entry is below 4"):

@@ -19,6 +19,7 @@ import pytest
 
 from caneflow.algorithms.cane.luenberger import LuenbergerSettings
 from caneflow.algorithms.cane.luenberger_fixed import METHOD, FixedLuenbergerObserver, observer_constants
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import Vector
 from caneflow.errors import CaneflowError
 from caneflow.messages import (
@@ -225,7 +226,10 @@ def model(samples: Sequence[Sample], settings: LuenbergerSettings | None = None)
             observer.speed(each.stamp, each.speed, each.quality, each.valid, each.delay)
         elif isinstance(each, Imu):
             gaps = observer.gaps
-            got = observer.imu(each.stamp, each.gyro, each.accel, each.orientation, each.linear_accel)
+            got = observer.imu(
+                each.stamp,
+                ImuReading(each.gyro, each.accel, orientation=each.orientation, linear_accel=each.linear_accel),
+            )
             pose = Pose(
                 stamp=each.stamp,
                 seq=len(made),

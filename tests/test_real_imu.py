@@ -16,6 +16,7 @@ from scipy.io import loadmat
 
 from caneflow.algorithms.cane.naive_ins import NaiveIns, NaiveInsSettings
 from caneflow.algorithms.cane.zero_velocity import StanceSettings, ZeroVelocity, ZeroVelocitySettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
 from caneflow.algorithms.inertial.initial_attitude import AttitudeMethod
 from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
@@ -158,7 +159,7 @@ def test_the_rows_that_the_importer_leaves_out_are_repetitions(steps: list[Readi
 def end_error(settings: ZeroVelocitySettings, steps: list[Reading]) -> tuple[float, float]:
     """How far, m, it ends from where it began, and how long, m, the walk was."""
     method = ZeroVelocity(settings)
-    track = np.array([method.imu(step.stamp, step.gyro, step.accel).position for step in steps])
+    track = np.array([method.imu(step.stamp, ImuReading(step.gyro, step.accel)).position for step in steps])
     length = float(np.linalg.norm(np.diff(track[::10], axis=0), axis=1).sum())
     return float(np.linalg.norm(track[-1] - track[0])), length
 
@@ -182,5 +183,5 @@ def test_without_zero_velocity_the_walk_drifts_away(steps: list[Reading]) -> Non
     attitude, naive = AttitudeFilter(AttitudeFilterSettings()), NaiveIns(NaiveInsSettings())
     for step in steps:
         orientation = attitude.update(step.stamp, step.gyro, step.accel).orientation
-        pose = naive.imu(step.stamp, step.gyro, step.accel, orientation, None)
+        pose = naive.imu(step.stamp, ImuReading(step.gyro, step.accel, orientation=orientation))
     assert math.hypot(*pose.position) > 10.0

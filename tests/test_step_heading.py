@@ -11,6 +11,7 @@ from scipy.signal import find_peaks
 from caneflow.algorithms import rotations
 from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
 from caneflow.algorithms.cane.step_heading import StepHeading, StepHeadingSettings
+from caneflow.algorithms.imu_reading import ImuReading
 
 Vector = rotations.Vector
 PERIOD = 0.01  # s
@@ -46,7 +47,7 @@ def follow(swinging: Swinging, settings: StepHeadingSettings | None = None) -> t
     yaws, gyros = swinging.samples()
     for k, (yaw, gyro) in enumerate(zip(yaws, gyros, strict=True)):
         orientation = rotations.from_yaw(yaw - math.pi / 2)  # the boresight is the body's y
-        estimate = shs.imu(START_NS + k * 10_000_000, gyro, None, orientation, None)
+        estimate = shs.imu(START_NS + k * 10_000_000, ImuReading(gyro, orientation=orientation))
     return shs, estimate
 
 
@@ -81,7 +82,7 @@ def test_as_many_steps_as_scipy_finds_between_stationary_points() -> None:
 
     shs = StepHeading(StepHeadingSettings(), boresight=(1.0, 0.0, 0.0), step_length=STEP)
     for k, (angle, rate) in enumerate(zip(yaw.tolist(), rates.tolist(), strict=True)):
-        shs.imu(START_NS + k * 10_000_000, (0.0, 0.0, rate), None, rotations.from_yaw(angle), None)
+        shs.imu(START_NS + k * 10_000_000, ImuReading((0.0, 0.0, rate), orientation=rotations.from_yaw(angle)))
     assert expected > 20
     # the first piece starts at a turning point that the one sees and the other does not
     assert abs(shs.steps - expected) <= 1
@@ -94,7 +95,7 @@ def test_while_walking_the_velocity_is_step_over_duration() -> None:
     speeds = []
     for k, (yaw, gyro) in enumerate(zip(yaws, gyros, strict=True)):
         orientation = rotations.from_yaw(yaw - math.pi / 2)
-        velocity = shs.imu(START_NS + k * 10_000_000, gyro, None, orientation, None).velocity
+        velocity = shs.imu(START_NS + k * 10_000_000, ImuReading(gyro, orientation=orientation)).velocity
         speeds.append(math.hypot(velocity[0], velocity[1]))
     assert speeds[int((1.5 + 3.5 * 0.6) / PERIOD)] == pytest.approx(STEP / 0.6, rel=0.05)
 
@@ -129,10 +130,10 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
 def test_a_gap_is_counted_and_a_missing_orientation_named() -> None:
     shs = StepHeading(StepHeadingSettings(), boresight=(0.0, 1.0, 0.0), step_length=STEP)
     for k in range(2):
-        shs.imu(START_NS + k * 700_000_000, (0.0, 0.0, 0.0), None, rotations.IDENTITY, None)
+        shs.imu(START_NS + k * 700_000_000, ImuReading((0.0, 0.0, 0.0), orientation=rotations.IDENTITY))
     assert shs.gaps == 1
     with pytest.raises(ValueError, match=r"shs: the imu sample has no orientation"):
-        shs.imu(START_NS + 2_000_000_000, (0.0, 0.0, 0.0), None, None, None)
+        shs.imu(START_NS + 2_000_000_000, ImuReading((0.0, 0.0, 0.0)))
 
 
 def pocketed(*, strides: int, stride: float, bobs: int, seed: int = 1) -> StepHeading:
@@ -147,7 +148,9 @@ def pocketed(*, strides: int, stride: float, bobs: int, seed: int = 1) -> StepHe
         forward, back = math.radians(200.0), math.radians(35.0)  # rad/s; the slow way back is no swing
         rate = forward * math.sin(2.0 * math.pi * phase) if phase < 0.5 else -back * math.sin(2.0 * math.pi * phase)
         force = 9.80665 + (2.0 * math.sin(2.0 * math.pi * bobs * t / stride) + impacts[k] if t > 0.0 else 0.0)
-        shs.imu(START_NS + k * 10_000_000, (rate, 0.0, 0.0), (0.0, 0.0, force), rotations.IDENTITY, None)
+        shs.imu(
+            START_NS + k * 10_000_000, ImuReading((rate, 0.0, 0.0), (0.0, 0.0, force), orientation=rotations.IDENTITY)
+        )
     return shs
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from caneflow.algorithms.cane.luenberger import LuenbergerSettings
 from caneflow.algorithms.cane.luenberger_fixed import METHOD, FixedLuenbergerObserver, observer_constants
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import Vector, from_yaw
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample, decode, encode
 from caneflow.messages.rig import Rig
@@ -94,7 +95,9 @@ class Firmware:
     def estimate(self, body: bytes) -> tuple[Kind, bytes]:
         imu = decode(body, Imu)
         try:
-            made = self.observer.imu(imu.stamp, imu.gyro, imu.accel, imu.orientation, imu.linear_accel)
+            made = self.observer.imu(
+                imu.stamp, ImuReading(imu.gyro, imu.accel, orientation=imu.orientation, linear_accel=imu.linear_accel)
+            )
         except ValueError:
             return Kind.REFUSED, b"\x02"
         pose = Pose(

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.zero_velocity import StanceDetector, StanceSettings, ZeroVelocity, ZeroVelocitySettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,
@@ -84,7 +85,7 @@ def walked(
             g = g + 0.02 * DEGREE * math.sqrt(RATE) * noise.standard_normal(3)
             a = a + 0.02 * math.sqrt(RATE) * noise.standard_normal(3)
         (p, q, r), (x, y, z) = g.tolist(), a.tolist()
-        estimate = method.imu(stamp, (p, q, r), (x, y, z), None, None)
+        estimate = method.imu(stamp, ImuReading((p, q, r), (x, y, z)))
     return estimate
 
 
@@ -137,7 +138,7 @@ def test_it_stands_in_the_stances_and_only_there(walk: list[tuple[int, Vector, V
     method = ZeroVelocity(ZeroVelocitySettings())
     late = []
     for stamp, gyro, accel in walk:
-        method.imu(stamp, gyro, accel)
+        method.imu(stamp, ImuReading(gyro, accel))
         t = (stamp - START_NS) * 1e-9 - REST
         if t < 0.0:
             continue
@@ -152,7 +153,7 @@ def test_a_long_rest_teaches_the_gyros_bias() -> None:
     bias = (0.2 * DEGREE, -0.3 * DEGREE, 0.4 * DEGREE)
     method = ZeroVelocity(ZeroVelocitySettings())
     for k in range(2000):
-        method.imu(START_NS + k * PERIOD_NS, bias, UP)
+        method.imu(START_NS + k * PERIOD_NS, ImuReading(bias, UP))
     assert method.gyro_bias == pytest.approx(bias, abs=0.02 * DEGREE)
 
 
@@ -192,7 +193,7 @@ def test_the_statistic_is_shoes(window: list[tuple[Vector, Vector]]) -> None:
 def test_the_covariance_stays_one(walk: list[tuple[int, Vector, Vector]]) -> None:
     method = ZeroVelocity(ZeroVelocitySettings())
     for k, (stamp, gyro, accel) in enumerate(walk):
-        covariance = method.imu(stamp, gyro, accel).covariance
+        covariance = method.imu(stamp, ImuReading(gyro, accel)).covariance
         if k % 100 == 0:
             assert covariance is not None
             assert covariance == pytest.approx(covariance.T)
@@ -202,8 +203,8 @@ def test_the_covariance_stays_one(walk: list[tuple[int, Vector, Vector]]) -> Non
 def test_over_a_gap_it_stays_and_says_that_it_does_not_know() -> None:
     method = ZeroVelocity(ZeroVelocitySettings())
     for k in range(100):
-        before = method.imu(START_NS + k * PERIOD_NS, STILL, UP)
-    after = method.imu(START_NS + 100 * PERIOD_NS + 2_000_000_000, STILL, UP)
+        before = method.imu(START_NS + k * PERIOD_NS, ImuReading(STILL, UP))
+    after = method.imu(START_NS + 100 * PERIOD_NS + 2_000_000_000, ImuReading(STILL, UP))
     assert method.gaps == 1
     assert after.position == before.position
     assert after.covariance is not None
@@ -213,12 +214,12 @@ def test_over_a_gap_it_stays_and_says_that_it_does_not_know() -> None:
 def test_what_cannot_be_used_is_refused() -> None:
     method = ZeroVelocity(ZeroVelocitySettings())
     with pytest.raises(ValueError, match="no accel"):
-        method.imu(START_NS, STILL, None)
+        method.imu(START_NS, ImuReading(STILL))
     with pytest.raises(ValueError, match="does not tell what is up"):
-        method.imu(START_NS, STILL, STILL)
-    method.imu(START_NS, STILL, UP)
+        method.imu(START_NS, ImuReading(STILL, STILL))
+    method.imu(START_NS, ImuReading(STILL, UP))
     with pytest.raises(ValueError, match="not after"):
-        method.imu(START_NS, STILL, UP)
+        method.imu(START_NS, ImuReading(STILL, UP))
 
 
 def fused(samples: list[tuple[int, Vector, Vector]]) -> list[Pose]:

@@ -7,10 +7,11 @@ from one sample to the next; what stays there for longer than a few samples is b
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Final, Generic, NamedTuple, TypeVar
+from typing import Annotated, Final, Generic, TypeVar
 
 from annotated_types import Ge, Le
 
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.quantities import Acceleration, Angle, Time, TurnRate
 from caneflow.algorithms.rotations import Quaternion, Vector
 from caneflow.physics import GRAVITY
@@ -81,16 +82,6 @@ class JumpGate(Generic[V]):
         return value
 
 
-class Readings(NamedTuple):
-    """One IMU sample, body frame; None: the sensor does not have it."""
-
-    gyro: Vector  # rad/s
-    accel: Vector | None  # m/s^2, specific force
-    mag: Vector | None  # uT
-    orientation: Quaternion | None  # w x y z, body to world
-    linear_accel: Vector | None  # m/s^2, gravity removed
-
-
 class GlitchGate:
     """A gate for each part of an IMU sample. `held`: which parts of the last sample were held."""
 
@@ -123,9 +114,9 @@ class GlitchGate:
         gates = self._gyro, self._accel, self._mag, self._orientation, self._linear_accel
         return any(gate.contradicted for gate in gates)
 
-    def update(self, stamp_ns: int, readings: Readings) -> Readings:
-        """The readings of a sample, the last good one in the place of each that is wild."""
-        gyro, accel, mag, orientation, linear = readings
+    def update(self, stamp_ns: int, reading: ImuReading) -> ImuReading:
+        """The reading, the last good one in the place of each that is wild."""
+        gyro, accel, mag, orientation, linear = reading
         gyro = self._gyro.update(stamp_ns, gyro)
         held: tuple[str, ...] = ("gyro",) if self._gyro.holding else ()
         if accel is not None:
@@ -145,7 +136,7 @@ class GlitchGate:
             if self._linear_accel.holding:
                 held += ("linear_accel",)
         self.held = held
-        return Readings(gyro, accel, mag, orientation, linear) if held else readings
+        return ImuReading(gyro, accel, mag, orientation, linear) if held else reading
 
 
 def _angle(a: Quaternion, b: Quaternion) -> float:

@@ -17,6 +17,7 @@ from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.cane.speed_gate import StatedVariance
 from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.gyro_yaw import GyroYaw
 from caneflow.algorithms.inertial.heave import HeaveObserver, HeaveSettings
 from caneflow.algorithms.inertial.imu_sample import (
@@ -141,7 +142,6 @@ class CaneFilter(DeadReckoning):
         self._forward_variance = StatedVariance(settings.speed_noise**2)
         self._left_variance = StatedVariance(math.inf)
         self._radar_speed = 0.0  # m/s, the last
-        self._field: Vector | None = None  # uT, body
         self._since_heading = self._since_sideways = 0.0  # s
         self._correction = 0j  # m in the gyro's frame, by which the track has yet to move
 
@@ -190,24 +190,14 @@ class CaneFilter(DeadReckoning):
             if share > 0.0 and (was_lonely or not lonely):
                 self._waiting.append(_Measured(stamp_ns, delay or 0.0, forward, left, xx / share, yy / share))
 
-    def magnetic_field(self, mag: Vector) -> None:
-        """Take the field (uT, body frame) of the IMU sample that comes next."""
-        self._field = mag
-
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> PoseEstimate:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`.
 
         Raises ValueError without an orientation, without any acceleration, or when time does not go on.
         """
-        orientation = normalized(required_orientation(orientation, "best"))
-        in_chips_frame = world_acceleration(orientation, accel, linear_accel, "best")
+        gyro = reading.gyro
+        orientation = normalized(required_orientation(reading.orientation, "best"))
+        in_chips_frame = world_acceleration(orientation, reading, "best")
         elapsed = self._clock.interval(stamp_ns) or 0.0
         interval = elapsed if elapsed <= min(self._settings.hole, LONGEST_INTERVAL) else 0.0
         stands = self._standing.update(stamp_ns, gyro, in_chips_frame)
@@ -241,7 +231,7 @@ class CaneFilter(DeadReckoning):
         self.heading.move(elapsed, turned, moved.real + shown.real, moved.imag + shown.imag)
         if self._turns.variance > 0.0:
             self._turns.move(moved + shown)
-        self._see_field(orientation)
+        self._see_field(orientation, reading.mag)
         self._since_heading += elapsed
         if self._since_heading >= self._settings.heading_interval:
             self._follow_heading()
@@ -357,14 +347,13 @@ class CaneFilter(DeadReckoning):
             variance = settings.sideways**2 + settings.sideways_per_turn**2 * self._pointing.turning
             motion.observe_velocity((left.real, left.imag), value, variance, per_pointing=-speed)
 
-    def _see_field(self, orientation: Quaternion) -> None:
+    def _see_field(self, orientation: Quaternion, mag: Vector | None) -> None:
         """Direction of the field in the gyro's frame; without a magnetometer, of what the chip takes for north."""
-        if self._field is None:
+        if mag is None:
             self.heading.field(self._yaw.offset, from_chip=True)
             return
-        x, y, _ = rotate(orientation, self._field)
+        x, y, _ = rotate(orientation, mag)
         self.heading.field(math.atan2(y, x) + self._yaw.offset, from_chip=False)
-        self._field = None
 
     def _follow_heading(self) -> None:
         self._since_heading = 0.0

@@ -14,6 +14,7 @@ from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings,
 from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading
 from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized
 
 Floats = NDArray[np.float64]
@@ -86,22 +87,14 @@ class CaneSmoother:
         # inputs go to the filter as they are
         self.speed = self._filter.speed
         self.velocity = self._filter.velocity
-        self.magnetic_field = self._filter.magnetic_field
 
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> None:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> None:
         """As `CaneFilter.imu`, but for the estimates, which come all together at the end."""
-        estimate = self._filter.imu(stamp_ns, gyro, accel, orientation, linear_accel)
-        assert orientation is not None, "the filter refuses samples without"
+        estimate = self._filter.imu(stamp_ns, reading)
+        assert reading.orientation is not None, "the filter refuses samples without"
         elapsed, turned = self._filter.heading.clock
-        sample = _Sample(len(self._motion.transitions), elapsed, turned, self._filter.yaw_offset, orientation, estimate)
-        self._samples.append(sample)
+        done, offset = len(self._motion.transitions), self._filter.yaw_offset
+        self._samples.append(_Sample(done, elapsed, turned, offset, reading.orientation, estimate))
 
     def estimates(self) -> list[PoseEstimate]:
         """One per IMU sample so far, each with all samples before and after it; height is the filter's."""

@@ -10,6 +10,7 @@ from typing import ClassVar, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, heading_of
 from caneflow.algorithms.rotations import Quaternion, Vector
 
@@ -31,7 +32,7 @@ class PoseEstimate(NamedTuple):
 class DeadReckoning(ABC):
     """The shape of every fusion method: ground speeds and IMU samples in, one estimate per IMU sample out.
 
-    A method that derives from it need not say that it has no use for speeds, velocities or the magnetic field.
+    A method that derives from it need not say that it has no use for speeds or velocities.
     """
 
     has_gates: ClassVar[bool] = False  # wild readings are held in it, and it wants them as they come
@@ -42,7 +43,7 @@ class DeadReckoning(ABC):
     def gaps(self) -> int:
         """How many intervals between IMU samples were longer than LONGEST_INTERVAL."""
 
-    def speed(  # noqa: B027 - some methods have no use for it, and for the two that follow
+    def speed(  # noqa: B027 - some methods have no use for it, or for the one that follows
         self, stamp_ns: int, speed: float, quality: float, valid: bool, delay: float | None
     ) -> None:
         """Take a new ground speed: m/s, its quality in m/s, and the s by which it lags its stamp."""
@@ -56,19 +57,9 @@ class DeadReckoning(ABC):
     ) -> None:
         """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
 
-    def magnetic_field(self, mag: Vector) -> None:  # noqa: B027
-        """Take the field (uT, body frame) of the IMU sample that comes next."""
-
     @abstractmethod
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> PoseEstimate:
-        """The estimate at `stamp_ns`, from an IMU sample in the body frame (rad/s, m/s^2, body to world)."""
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
+        """The estimate at `stamp_ns`, from an IMU sample."""
 
 
 class VelocityMeasurement(NamedTuple):

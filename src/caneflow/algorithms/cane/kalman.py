@@ -18,6 +18,7 @@ from caneflow.algorithms.cane.dead_reckoning import (
     PoseEstimate,
     VelocityMeasurement,
 )
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import (
     LONGEST_INTERVAL,
     SampleClock,
@@ -25,7 +26,7 @@ from caneflow.algorithms.inertial.imu_sample import (
     world_acceleration,
 )
 from caneflow.algorithms.quantities import Angle, Density, Factor, Fraction, Speed, Time, Zero
-from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.algorithms.rotations import Vector
 
 INITIAL_ACCELERATION = 3.0  # m/s^2, sd before the first sample and after a gap: the swing's own
 INITIAL_VELOCITY = 1.0  # m/s, sd likewise: somewhere between standing and walking
@@ -176,20 +177,13 @@ class KalmanFilter(DeadReckoning):
         """Take a new ground speed (m/s) and its quality (m/s)."""
         self._ground.speed(stamp_ns, speed, quality, valid, delay)
 
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> PoseEstimate:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`, with the covariance of position and velocity.
 
         Raises ValueError without an orientation, without any acceleration, or when time does not go on.
         """
-        orientation = required_orientation(orientation, "kalman")
-        acceleration = world_acceleration(orientation, accel, linear_accel, "kalman")
+        orientation = required_orientation(reading.orientation, "kalman")
+        acceleration = world_acceleration(orientation, reading, "kalman")
         interval = self._clock.interval(stamp_ns)
         if interval is not None:
             self._correct(self._ground.take(stamp_ns))

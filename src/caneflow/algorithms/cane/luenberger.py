@@ -10,6 +10,7 @@ from typing import Annotated, TypeAlias
 from annotated_types import Ge, Gt, Le, Lt
 
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, DelayCompensation, GroundVelocity, PoseEstimate
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import (
     LONGEST_INTERVAL,
     SampleClock,
@@ -17,7 +18,7 @@ from caneflow.algorithms.inertial.imu_sample import (
     world_acceleration,
 )
 from caneflow.algorithms.quantities import Time
-from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.algorithms.rotations import Vector
 
 Pole: TypeAlias = Annotated[float, Gt(-1), Lt(1)]
 GainElement: TypeAlias = Annotated[float, Ge(-1e4), Le(1e4)]  # of an observer that converges: a few 1 / interval
@@ -94,20 +95,13 @@ class LuenbergerObserver(DeadReckoning):
         """Take a new ground speed (m/s); the observer has no use for its quality (m/s)."""
         self._ground.speed(stamp_ns, speed, quality, valid, delay)
 
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> PoseEstimate:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`; no covariance, an observer has none.
 
         Raises ValueError without an orientation, without any acceleration, or when time does not go on.
         """
-        orientation = required_orientation(orientation, "luenberger")
-        acceleration = world_acceleration(orientation, accel, linear_accel, "luenberger")
+        orientation = required_orientation(reading.orientation, "luenberger")
+        acceleration = world_acceleration(orientation, reading, "luenberger")
         interval = self._clock.interval(stamp_ns)
         if interval is not None:
             self._advance(stamp_ns, interval)

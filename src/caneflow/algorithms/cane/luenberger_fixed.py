@@ -19,7 +19,8 @@ from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.luenberger import LuenbergerSettings
 from caneflow.algorithms.cane.speed_gate import LONGEST_GAP
 from caneflow.algorithms.glitches import JumpGate
-from caneflow.algorithms.inertial.imu_sample import required_orientation
+from caneflow.algorithms.imu_reading import ImuReading
+from caneflow.algorithms.inertial.imu_sample import required_acceleration, required_orientation
 from caneflow.algorithms.rotations import Quaternion, Vector
 from caneflow.physics import GRAVITY
 
@@ -234,31 +235,20 @@ class FixedLuenbergerObserver(DeadReckoning):
         else:
             self._waiting.append(_Speed(stamp_ns, taken, delay_ns))
 
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> PoseEstimate:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`; no covariance, an observer has none.
 
         Raises ValueError without an orientation, without any acceleration, or when time does not go on.
         """
-        orientation = required_orientation(orientation, METHOD)
+        orientation = required_orientation(reading.orientation, METHOD)
         unit = _unit(orientation)
-        body = accel if linear_accel is None else linear_accel
-        if body is None:
-            raise ValueError(
-                "luenberger_fixed: the imu sample has neither linear_accel nor accel; it needs one of them"
-            )
+        body, without_gravity = required_acceleration(reading, METHOD), reading.linear_accel is not None
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"imu: stamp {stamp_ns} ns is not after the one before, {self._last_ns} ns")
         unit, orientation = self._orientations.update(stamp_ns, (unit, orientation))
         x, y, z = rotated(unit, self._taken_vector(body))
-        measured = self._accelerations.update(stamp_ns, (x, y, z if linear_accel is not None else z - GRAVITY_FIXED))
-        self._note_held("accel" if linear_accel is None else "linear_accel")
+        measured = self._accelerations.update(stamp_ns, (x, y, z if without_gravity else z - GRAVITY_FIXED))
+        self._note_held("linear_accel" if without_gravity else "accel")
         if self._last_ns is not None:
             self._advance(stamp_ns, stamp_ns - self._last_ns)
         self._last_ns = stamp_ns

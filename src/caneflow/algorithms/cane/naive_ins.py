@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import SampleClock, required_orientation, world_acceleration
-from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.algorithms.rotations import Vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,20 +27,13 @@ class NaiveIns(DeadReckoning):
         """How many intervals between IMU samples were longer than LONGEST_INTERVAL; integrated like any other."""
         return self._clock.gaps
 
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> PoseEstimate:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`; starts at rest in the origin; no covariance.
 
         Raises ValueError without an orientation, without any acceleration, or when time does not go on.
         """
-        orientation = required_orientation(orientation, "naive_ins")
-        acceleration = world_acceleration(orientation, accel, linear_accel, "naive_ins")
+        orientation = required_orientation(reading.orientation, "naive_ins")
+        acceleration = world_acceleration(orientation, reading, "naive_ins")
         interval = self._clock.interval(stamp_ns)
         if interval is not None:
             velocity = _trapezium(self._velocity, self._acceleration, acceleration, interval)

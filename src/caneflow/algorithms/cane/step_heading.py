@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.step_bob import StepBob
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import (
     LONGEST_INTERVAL,
     SampleClock,
@@ -17,7 +18,7 @@ from caneflow.algorithms.inertial.imu_sample import (
     world_acceleration,
 )
 from caneflow.algorithms.quantities import Time, TurnRate
-from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.algorithms.rotations import Vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,25 +62,20 @@ class StepHeading(DeadReckoning):
         """How many intervals between IMU samples were longer than LONGEST_INTERVAL."""
         return self._clock.gaps
 
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None,
-        linear_accel: Vector | None,
-    ) -> PoseEstimate:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`; height stays 0; velocity is the last step's mean; no covariance.
 
         Raises ValueError without an orientation or when time does not go on.
         """
-        orientation = required_orientation(orientation, "shs")
+        orientation = required_orientation(reading.orientation, "shs")
         interval = self._clock.interval(stamp_ns)
+        gyro = reading.gyro
         norm = math.sqrt(gyro[0] ** 2 + gyro[1] ** 2 + gyro[2] ** 2)
         cos_psi, sin_psi = heading_of(orientation, self._boresight)
         self._since += interval or 0.0
-        if interval is not None and interval <= LONGEST_INTERVAL and (accel is not None or linear_accel is not None):
-            self._bob.update(interval, world_acceleration(orientation, accel, linear_accel, "shs")[2])
+        accelerates = reading.accel is not None or reading.linear_accel is not None
+        if interval is not None and interval <= LONGEST_INTERVAL and accelerates:
+            self._bob.update(interval, world_acceleration(orientation, reading, "shs")[2])
         self._peak = max(self._peak, norm)
         self._heading_sum = self._heading_sum[0] + cos_psi, self._heading_sum[1] + sin_psi
         if self._since >= self._settings.shortest_swing and self._stationary(norm):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.glitches import GlitchSettings
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleClock, required_force
 from caneflow.algorithms.inertial.initial_attitude import level
 from caneflow.algorithms.quantities import Acceleration, Angle, Density, Time, TurnRate
@@ -143,20 +144,13 @@ class ZeroVelocity(DeadReckoning):
         """m/s^2, body."""
         return self._accel_bias
 
-    def imu(
-        self,
-        stamp_ns: int,
-        gyro: Vector,
-        accel: Vector | None,
-        orientation: Quaternion | None = None,
-        linear_accel: Vector | None = None,
-    ) -> PoseEstimate:
+    def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns` from rad/s and m/s^2 in the body frame; it must begin at rest.
 
         An orientation or linear acceleration by the chip is not used: they are not the strapdown's.
         Raises ValueError without `accel`, or when time does not go on.
         """
-        accel = required_force(accel, "zero_velocity")
+        gyro, accel = reading.gyro, required_force(reading.accel, "zero_velocity")
         before = level(accel) if self._orientation is None else self._orientation
         interval = self._clock.interval(stamp_ns)
         gyro_used, force_used = self._less_bias(gyro, accel)

@@ -2,6 +2,7 @@
 
 import math
 
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import Quaternion, Vector, rotate
 from caneflow.physics import GRAVITY
 
@@ -50,24 +51,22 @@ def required_force(accel: Vector | None, method: str) -> Vector:
     return accel
 
 
-def required_acceleration(accel: Vector | None, linear_accel: Vector | None, method: str) -> Vector:
+def required_acceleration(reading: ImuReading, method: str) -> Vector:
     """The one without gravity (m/s^2, body) where there is one, else the other; ValueError when there is neither."""
-    if linear_accel is not None:
-        return linear_accel
-    if accel is None:
+    if reading.linear_accel is not None:
+        return reading.linear_accel
+    if reading.accel is None:
         raise ValueError(f"{method}: the imu sample has neither linear_accel nor accel; it needs one of them")
-    return accel
+    return reading.accel
 
 
-def world_acceleration(
-    orientation: Quaternion, accel: Vector | None, linear_accel: Vector | None, method: str
-) -> Vector:
-    """Acceleration in R0, m/s^2, gravity removed: by the chip where it does, else by the attitude.
+def world_acceleration(orientation: Quaternion, reading: ImuReading, method: str) -> Vector:
+    """Acceleration in R0, m/s^2, gravity removed: by the chip where it does, else by the attitude `orientation`.
 
     Raises ValueError when there is neither `linear_accel` nor `accel`.
     """
-    x, y, z = rotate(orientation, required_acceleration(accel, linear_accel, method))
-    return (x, y, z) if linear_accel is not None else (x, y, z - GRAVITY)
+    x, y, z = rotate(orientation, required_acceleration(reading, method))
+    return (x, y, z) if reading.linear_accel is not None else (x, y, z - GRAVITY)
 
 
 def heading_of(orientation: Quaternion, boresight: Vector) -> tuple[float, float]:

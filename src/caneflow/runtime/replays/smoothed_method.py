@@ -9,6 +9,7 @@ from typing import Any
 
 from caneflow.algorithms.cane.cane_filter import CaneFilterSettings
 from caneflow.algorithms.cane.cane_smoother import CaneSmoother
+from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.messages import GroundSpeed, Imu, Pose, Sample
 from caneflow.messages.rig import Rig
 from caneflow.runtime.program import Sink
@@ -33,9 +34,10 @@ def smoothed_poses(
                 smoother.velocity(speed.stamp, speed.velocity, speed.velocity_cov, speed.velocity_delay)
             smoother.speed(speed.stamp, speed.speed, speed.quality, speed.valid, speed.delay)
             speed = next(coming, None)
-        if imu.mag is not None:
-            smoother.magnetic_field(imu.mag)
-        smoother.imu(imu.stamp, imu.gyro, imu.accel, imu.orientation, imu.linear_accel)
+        reading = ImuReading(
+            gyro=imu.gyro, accel=imu.accel, mag=imu.mag, orientation=imu.orientation, linear_accel=imu.linear_accel
+        )
+        smoother.imu(imu.stamp, reading)
     for imu, estimate in zip(readings, smoother.estimates(), strict=True):
         yield Pose(
             stamp=imu.stamp,
