@@ -27,6 +27,7 @@ from caneflow.algorithms.inertial.imu_sample import (
 )
 from caneflow.algorithms.quantities import Angle, Density, Factor, Fraction, Speed, Time, Zero
 from caneflow.algorithms.rotations import Vector
+from caneflow.algorithms.scalar_update import updated
 
 INITIAL_ACCELERATION = 3.0  # m/s^2, sd before the first sample and after a gap: the swing's own
 INITIAL_VELOCITY = 1.0  # m/s, sd likewise: somewhere between standing and walking
@@ -58,29 +59,12 @@ class AxisCovariance:
         self.vv, self.vp, self.pp = INITIAL_VELOCITY**2, 0.0, 0.0
 
     def correct_acceleration(self, noise: float) -> tuple[float, float]:
-        """Gains on (a, v) of a measured a with variance `noise`; none on p. Joseph form."""
-        aa, av, ap = self.aa, self.av, self.ap
-        spread = aa + noise
-        k_a, k_v = aa / spread, av / spread
-        # (I - K C) P (I - K C)' + K R K', written out; holds for any gain, so also for none on p
-        self.aa += k_a * (k_a * spread - 2.0 * aa)
-        self.av += k_a * k_v * spread - k_a * av - k_v * aa
-        self.vv += k_v * (k_v * spread - 2.0 * av)
-        self.ap -= k_a * ap
-        self.vp -= k_v * ap
-        return k_a, k_v
+        """Gains on (a, v) of a measured a with variance `noise`; none on p."""
+        return self._correct((self.aa, self.av, self.ap), self.aa + noise)
 
     def correct_velocity(self, noise: float) -> tuple[float, float]:
-        """Gains on (a, v) of a measured v with variance `noise`; none on p. Joseph form."""
-        vv, av, vp = self.vv, self.av, self.vp
-        spread = vv + noise
-        k_a, k_v = av / spread, vv / spread
-        self.aa += k_a * (k_a * spread - 2.0 * av)
-        self.av += k_a * k_v * spread - k_a * vv - k_v * av
-        self.vv += k_v * (k_v * spread - 2.0 * vv)
-        self.ap -= k_a * vp
-        self.vp -= k_v * vp
-        return k_a, k_v
+        """Gains on (a, v) of a measured v with variance `noise`; none on p."""
+        return self._correct((self.av, self.vv, self.vp), self.vv + noise)
 
     def predict(self, interval: float, acceleration_noise: float, velocity_noise: float) -> None:
         """One step of a' = a + w_a, v' = v + T a + w_v, p' = p + T v'; the noises are variances of the step."""
@@ -92,6 +76,12 @@ class AxisCovariance:
         self.ap = ap + interval * self.av
         self.pp += 2.0 * interval * vp + interval * interval * self.vv
         self.vp = vp + interval * self.vv
+
+    def _correct(self, across: Vector, spread: float) -> tuple[float, float]:
+        # without the gain on p, pp stays as it was; by Joseph's form nothing else depends on that gain
+        covariance = self.aa, self.av, self.ap, self.vv, self.vp, self.pp
+        (k_a, k_v, _), (self.aa, self.av, self.ap, self.vv, self.vp, _) = updated(covariance, across, spread)
+        return k_a, k_v
 
     def forget(self, interval: float) -> None:
         """A gap, where Q does not reach: a and v as unknown as at the start, p by what such a v may have added."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caneflow.algorithms.quantities import Acceleration, Angle, Density, Factor, Speed, Zero
+from caneflow.algorithms.scalar_update import update
 
 Floats = NDArray[np.float64]
 
@@ -142,9 +143,8 @@ class WalkMotion:
         off = abs(innovation) / math.sqrt(spread)
         # an outlier is believed to be as uncertain as it is far off
         spread = max(spread, (innovation / self._settings.outlier) ** 2)
-        gain = ph / spread
+        gain = update(self._p, ph, spread)
         self._x = [a + g * innovation for a, g in zip(x, gain.tolist(), strict=True)]
-        self._p -= gain[:, None] * ph
         return off
 
     def doubt(self, speed: float, lasting: float) -> None:

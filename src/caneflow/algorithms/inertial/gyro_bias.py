@@ -15,6 +15,7 @@ from typing import TypeAlias
 
 from caneflow.algorithms.quantities import Acceleration, Density, Factor, Time, TurnRate, Zero
 from caneflow.algorithms.rotations import Quaternion, Vector
+from caneflow.algorithms.scalar_update import Covariance, updated
 
 # A row of H, and the turn rate (rad/s) about that axis of the world that was taken off as bias; both low-passed.
 Row: TypeAlias = tuple[float, float, float, float]
@@ -95,8 +96,7 @@ class GyroBias:
         self._settings = settings
         self._bias: Vector = (0.0, 0.0, 0.0)
         variance = settings.initial**2
-        self._xx = self._yy = self._zz = variance
-        self._xy = self._xz = self._yz = 0.0
+        self._p: Covariance = variance, 0.0, 0.0, variance, 0.0, variance
         self._gyro: Vector = (0.0, 0.0, 0.0)  # rad, at rest since the last correction
         self._rested = 0.0  # s
         self._tilt = (0.0, 0.0)  # rad, since the last correction
@@ -111,7 +111,8 @@ class GyroBias:
     @property
     def sd(self) -> Vector:
         """rad/s, standard deviation per axis of the body."""
-        return math.sqrt(self._xx), math.sqrt(self._yy), math.sqrt(self._zz)
+        xx, _, _, yy, _, zz = self._p
+        return math.sqrt(xx), math.sqrt(yy), math.sqrt(zz)
 
     def at_rest(self, gyro: Vector, deviation: float, interval: float) -> None:
         """A sample at rest: the gyro says its bias, and a sway of which `deviation` (rad/s) is the quick part."""
@@ -169,31 +170,23 @@ class GyroBias:
     def _grow(self, interval: float) -> None:
         """The random walk; nothing gets less known than it was at first."""
         added, limit = self._settings.walk**2 * interval, self._settings.initial**2
-        self._xx = min(self._xx + added, limit)
-        self._yy = min(self._yy + added, limit)
-        self._zz = min(self._zz + added, limit)
+        xx, xy, xz, yy, yz, zz = self._p
+        self._p = min(xx + added, limit), xy, xz, min(yy + added, limit), yz, min(zz + added, limit)
 
     def _correct(self, row: Vector, residual: float, variance: float) -> None:
         """The Kalman filter's update by residual = row . (true bias - bias) + noise, rad/s."""
         a, b, c = row
-        px = self._xx * a + self._xy * b + self._xz * c
-        py = self._xy * a + self._yy * b + self._yz * c
-        pz = self._xz * a + self._yz * b + self._zz * c
-        spread = a * px + b * py + c * pz + variance
+        xx, xy, xz, yy, yz, zz = self._p
+        px, py, pz = xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c
+        (gain_x, gain_y, gain_z), self._p = updated(self._p, (px, py, pz), a * px + b * py + c * pz + variance)
         largest = self._settings.largest
-        share = max(-largest, min(largest, residual)) / spread
+        residual = max(-largest, min(largest, residual))
         x, y, z = self._bias
         self._bias = (
-            max(-largest, min(largest, x + px * share)),
-            max(-largest, min(largest, y + py * share)),
-            max(-largest, min(largest, z + pz * share)),
+            max(-largest, min(largest, x + gain_x * residual)),
+            max(-largest, min(largest, y + gain_y * residual)),
+            max(-largest, min(largest, z + gain_z * residual)),
         )
-        self._xx -= px * px / spread
-        self._yy -= py * py / spread
-        self._zz -= pz * pz / spread
-        self._xy -= px * py / spread
-        self._xz -= px * pz / spread
-        self._yz -= py * pz / spread
 
 
 def horizontal_rows(orientation: Quaternion, bias: Vector) -> tuple[Row, Row]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from caneflow.algorithms.quantities import Acceleration, Density, Length
+from caneflow.algorithms.scalar_update import Covariance, updated
 
 _UNKNOWN_RATE: Final = 0.12  # m/s, sd: a bob of 12 mm at 1.1 Hz
 
@@ -24,7 +25,7 @@ class HeaveSettings:
 
 
 class HeaveObserver:
-    """A Kalman filter of three states, written out: numpy's calls would cost more than its sums."""
+    """A Kalman filter of three states, its prediction written out."""
 
     def __init__(self, settings: HeaveSettings) -> None:
         self._settings = settings
@@ -32,50 +33,46 @@ class HeaveObserver:
         self.height = 0.0
         self.rate = 0.0
         self._bias = 0.0
-        self._zz, self._zv, self._zb = 0.02**2, 0.0, 0.0
-        self._vv, self._vb, self._bb = 0.05**2, 0.0, settings.bias**2
+        self._p: Covariance = 0.02**2, 0.0, 0.0, 0.05**2, 0.0, settings.bias**2  # zz, zv, zb, vv, vb, bb
 
     @property
     def height_variance(self) -> float:
         """Of the height, m^2, but for the person's own difference from the nominal height."""
-        return self._zz
+        return self._p[0]
 
     @property
     def rate_variance(self) -> float:
         """Of the vertical speed, (m/s)^2."""
-        return self._vv
+        return self._p[3]
 
     def update(self, interval: float, acceleration: float, nominal_height: float) -> None:
         """Go on by `interval` s at a vertical `acceleration` (m/s^2, gravity removed); then see the nominal height."""
         if not self._started:
             self.height, self._started = nominal_height, True
         self._predict(interval, acceleration - self._bias)
-        variance = self._zz + self._settings.height_noise**2
-        gain_z, gain_v, gain_b = self._zz / variance, self._zv / variance, self._zb / variance
+        across = self._p[:3]
+        (gain_z, gain_v, gain_b), self._p = updated(self._p, across, across[0] + self._settings.height_noise**2)
         off = nominal_height - self.height
         self.height += gain_z * off
         self.rate += gain_v * off
         self._bias += gain_b * off
-        self._vv -= gain_v * self._zv
-        self._vb -= gain_v * self._zb
-        self._bb -= gain_b * self._zb
-        self._zv -= gain_z * self._zv
-        self._zb -= gain_z * self._zb
-        self._zz -= gain_z * self._zz
 
     def bridge(self, elapsed: float) -> None:
         """Go on by `elapsed` s without a sample: the height stays, its rate is as unknown as at the start."""
-        self._zz += self._vv * elapsed * elapsed
-        self._zv = self._vb = 0.0
-        self.rate, self._vv = 0.0, _UNKNOWN_RATE**2
-        self._bb += elapsed * self._settings.bias_walk**2
+        zz, _, zb, vv, _, bb = self._p
+        zz, bb = zz + vv * elapsed * elapsed, bb + elapsed * self._settings.bias_walk**2
+        self._p = zz, 0.0, zb, _UNKNOWN_RATE**2, 0.0, bb
+        self.rate = 0.0
 
     def _predict(self, t: float, acceleration: float) -> None:
         self.height += t * (self.rate + 0.5 * t * acceleration)
         self.rate += t * acceleration
-        self._zz += t * (2.0 * self._zv + t * self._vv)
-        self._zv += t * (self._vv - self._zb - t * self._vb)
-        self._zb += t * self._vb
-        self._vv += t * (self._settings.acceleration_noise**2 - 2.0 * self._vb + t * self._bb)
-        self._vb -= t * self._bb
-        self._bb += t * self._settings.bias_walk**2
+        zz, zv, zb, vv, vb, bb = self._p
+        self._p = (
+            zz + t * (2.0 * zv + t * vv),
+            zv + t * (vv - zb - t * vb),
+            zb + t * vb,
+            vv + t * (self._settings.acceleration_noise**2 - 2.0 * vb + t * bb),
+            vb - t * bb,
+            bb + t * self._settings.bias_walk**2,
+        )
