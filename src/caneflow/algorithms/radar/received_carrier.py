@@ -108,11 +108,7 @@ def _carrier_of(pairs: Floats) -> ReceivedCarrier | None:
 
 def echoes(scans: NDArray[np.number], times: Floats, usual: float, range_step: float) -> list[tuple[float, float]]:
     """Doppler frequency (Hz) and speed (m/s) of the strongest echoes of one window of scans `usual` s apart."""
-    from scipy import (
-        fft,  # here: a replay asks the P440's driver for its ports alone, and this takes a third of a second
-    )
-
-    frequencies = fft.rfftfreq(scans.shape[1], 2.0 * range_step / SPEED_OF_LIGHT)
+    frequencies = np.fft.rfftfreq(scans.shape[1], 2.0 * range_step / SPEED_OF_LIGHT)
     inside = (frequencies > BAND[0]) & (frequencies < BAND[1])
     if np.count_nonzero(inside) < LEAST_LINES:
         return []
@@ -121,12 +117,12 @@ def echoes(scans: NDArray[np.number], times: Floats, usual: float, range_step: f
     if np.abs(np.cumsum(intervals - period)).max() > 0.6 * usual or abs(period / usual - 1.0) > 0.05:
         return []
     moving = scans - scans.mean(axis=0)
-    lines = fft.rfft(moving, axis=1) * inside
+    lines = np.fft.rfft(moving, axis=1) * inside
     analytic = np.zeros(moving.shape, dtype=np.complex128)
     analytic[:, : lines.shape[1]] = 2.0 * lines
     hann = np.hanning(WINDOW + 2)[1:-1, None]
-    magnitude = np.abs(fft.fft(fft.ifft(analytic, axis=1) * hann, TRANSFORM, axis=0))
-    doppler = fft.fftfreq(TRANSFORM, period)
+    magnitude = np.abs(np.fft.fft(np.fft.ifft(analytic, axis=1) * hann, TRANSFORM, axis=0))
+    doppler = np.fft.fftfreq(TRANSFORM, period)
     usable = np.abs(doppler) < FASTEST_TURN / period
     usable &= np.abs(doppler) > 2.0 * SLOWEST * NOMINAL / SPEED_OF_LIGHT
     least = CLEAR * float(np.median(magnitude))
@@ -149,10 +145,8 @@ def echoes(scans: NDArray[np.number], times: Floats, usual: float, range_step: f
 
 def _speed(echo: Floats, frequency: float, period: float, range_step: float) -> float | None:
     """Speed (m/s) that fits all lines of an echo's spectrum best, near what `frequency` says; None: no single one."""
-    from scipy import fft
-
-    spectrum = fft.rfft(echo * np.hanning(echo.shape[1]), TRANSFORM, axis=1)
-    lines = fft.rfftfreq(TRANSFORM, 2.0 * range_step / SPEED_OF_LIGHT)
+    spectrum = np.fft.rfft(echo * np.hanning(echo.shape[1]), TRANSFORM, axis=1)
+    lines = np.fft.rfftfreq(TRANSFORM, 2.0 * range_step / SPEED_OF_LIGHT)
     inside = (lines > BAND[0]) & (lines < BAND[1])
     spectrum, lines = spectrum[:, inside], lines[inside]
     rough = 0.5 * SPEED_OF_LIGHT * frequency / NOMINAL
