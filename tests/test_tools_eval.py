@@ -236,6 +236,7 @@ def test_the_table_has_a_row_for_every_walk_and_the_papers_figures_beside_ours(
 ) -> None:
     text = "\n".join(evaluate.lines(answer[0]))
     assert text.count("swing_1") == text.count("stops_2") == 1
+    assert all(len(line) <= 80 for line in text.partition("\n\nend-start:")[0].splitlines()), text
     luenberger = next(line for line in text.splitlines() if line.split()[:2] == ["luenberger", "here"])
     figures = list(answer[0]["luenberger"].values())
     mean = sum(each["final_distance"] for each in figures) / 2

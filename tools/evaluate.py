@@ -24,18 +24,18 @@ from caneflow.runtime.replays.results_file import ResultsFile
 
 FAILED_STATUS = 1
 
-# Figure -> its head, its unit and how many digits are worth reading.
+# Figure -> its head, whose second word stands below the first, its unit and how many digits are worth reading.
 COLUMNS = {
-    "final_distance": ("end-start", "m", 3),
+    "final_distance": ("end- start", "m", 3),
     "final_error": ("end error", "m", 3),
     "ate": ("ATE", "m", 3),
     "rpe": ("RPE", "m", 3),
-    "drift_percent": ("drift", "%", 2),
-    "path_length_ratio": ("path", "ratio", 3),
-    "extent": ("extent", "ratio", 3),
-    "local_1s": ("local 1 s", "m", 3),
-    "local_5s": ("local 5 s", "m", 3),
-    "nees": ("NEES", "", 2),
+    "drift_percent": ("drift", "%", 1),
+    "path_length_ratio": ("path ratio", "", 3),
+    "extent": ("extent ratio", "", 3),
+    "local_1s": ("local 1s", "m", 3),
+    "local_5s": ("local 5s", "m", 3),
+    "nees": ("NEES", "", 1),
 }
 NOTES = """\
 end-start: from where the track ends to where it starts, the paper's error; none but on a closed walk.
@@ -179,7 +179,7 @@ def write_csv(by_method: By, path: Path) -> None:
 
 def lines(by_method: By) -> Iterator[str]:
     """The table of all walks, then Table I's rows, then what the columns mean."""
-    yield from _aligned(_walks(by_method), left=2)
+    yield from _aligned(_walks(by_method), left=1)
     yield ""
     yield from _aligned(_summary(by_method), left=2)
     yield ""
@@ -191,34 +191,23 @@ def lines(by_method: By) -> Iterator[str]:
 
 
 def _walks(by_method: By) -> Iterator[Sequence[str]]:
-    yield "recording", "method", *(head for head, _, _ in COLUMNS.values())
-    yield "", "", *(unit for _, unit, _ in COLUMNS.values())
+    heads = [(*head.partition(" ")[::2], unit) for head, unit, _ in COLUMNS.values()]
+    yield from zip(("recording", "", ""), *heads, strict=True)
     recordings = dict.fromkeys(recording for each in by_method.values() for recording in each)
     for recording in recordings:
-        name = Path(recording).stem
+        yield (Path(recording).stem,)
         for method, by_recording in by_method.items():
             if recording in by_recording:
                 figures = by_recording[recording]
-                yield name, method, *(_number(figures[key], digits) for key, (_, _, digits) in COLUMNS.items())
-                name = ""
+                numbers = (_number(figures[key], digits) for key, (_, _, digits) in COLUMNS.items())
+                yield f"  {method}", *numbers
 
 
 def _summary(by_method: By) -> Iterator[Sequence[str]]:
-    yield (
-        "method",
-        "",
-        "walks",
-        "end-start max",
-        "sd",
-        "mean",
-        "growth",
-        "end error max",
-        "sd",
-        "mean",
-        "ATE",
-        "NEES",
-    )
-    yield "", "", "", "m", "m", "m", "m/s", "m", "m", "m", "mean, m", "mean"
+    yield "", "", "", "end-", "", "", "", "end", "", "", "", ""
+    yield "", "", "", "start", "", "", "", "error", "", "", "mean", "mean"
+    yield "method", "", "walks", "max", "sd", "mean", "growth", "max", "sd", "mean", "ATE", "NEES"
+    yield "", "", "", "m", "m", "m", "m/s", "m", "m", "m", "m", ""
     for method, by_recording in by_method.items():
         all_figures = list(by_recording.values())
         if all_figures:
@@ -255,15 +244,19 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _aligned(rows: Iterator[Sequence[str]], left: int) -> Iterator[str]:
-    """Rows as lines: the first `left` columns flush left, the others flush right."""
+    """Rows as lines: the first `left` columns flush left, the others flush right; a row of one cell is a heading."""
     table = list(rows)
-    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
+    aligned = [row for row in table if len(row) > 1]
+    widths = [max(map(len, column)) for column in zip(*aligned, strict=True)]
     for row in table:
+        if len(row) == 1:
+            yield row[0]
+            continue
         cells = [
             cell.ljust(width) if column < left else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         ]
-        yield "  ".join(cells).rstrip()
+        yield " ".join(cells).rstrip()
 
 
 def _shown(results: Iterator[Evaluation], total: int) -> Iterator[Evaluation]:

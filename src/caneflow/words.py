@@ -151,6 +151,7 @@ def _command() -> TyperGroup:
     for word, (module, summary) in WORDS.items():
         if find_spec(f"{TOOLS}.{module}"):
             group.add_command(Word(word, module, summary))
+    _without_types_of_flags(group)
     return group
 
 
@@ -189,7 +190,17 @@ def _tool(module: str) -> Any:
             app.command(word, help=_flowing(chosen.__doc__))(chosen)
     else:
         app.command(help=_flowing(tool.command.__doc__))(tool.command)
-    return typer.main.get_command(app)
+    return _without_types_of_flags(typer.main.get_command(app))
+
+
+def _without_types_of_flags(command: Any) -> Any:
+    """The command; its help says no type of what takes no value."""
+    for each in getattr(command, "commands", {}).values():
+        _without_types_of_flags(each)
+    for parameter in (*command.params, command.get_help_option(typer.Context(command))):
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
+    return command
 
 
 def _flowing(text: str | None) -> str | None:
