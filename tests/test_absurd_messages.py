@@ -46,6 +46,7 @@ from operators.doppler import Doppler
 from operators.ego_velocity import EgoVelocityOperator
 from operators.fusion import Fusion
 from operators.ground_speed import GroundSpeedOperator
+from operators.radar_obstacles import RadarObstaclesOperator
 from operators.room_tracker import RoomTrackerOperator
 from operators.surroundings import Surroundings
 
@@ -327,6 +328,7 @@ CASES = {
         )
         for method in ("particle", "heading_particle", "ekf", "best")
     },
+    "radar_obstacles": Case(RadarObstaclesOperator, {"frame": RadarFrame, "pose": Pose}, most=300),
     "surroundings": Case(Surroundings, {"pose": Pose, "imu": Imu, "upper": Ranges, "lower": Ranges}, most=300),
     "room_tracker best cane": Case(RoomTrackerOperator, {**ROOM, "cane": Pose}),
 }
