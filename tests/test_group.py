@@ -2,11 +2,14 @@
 
 from collections.abc import Mapping
 
+import msgspec
 import pytest
 
 from caneflow.messages import GroundSpeed, Imu, Sample, decode, sample_key
+from caneflow.messages.control import LeftOut
 from caneflow.runtime import Emitted, Operator, Sink
 from caneflow.runtime.plan import InputPlan, NodePlan, OutputPlan
+from caneflow.runtime.stages.decisions import Decided, WasLeftOut, WentOn
 from caneflow.runtime.stages.group import Group, in_order
 from caneflow.runtime.stages.merge import END
 from caneflow.runtime.stages.source_stage import Feed
@@ -166,3 +169,15 @@ def test_local_wires_are_counted_as_others_are(made: tuple[Group, Both, Keep]) -
         "speed": (2, 2),
     }
     assert counters["keep"].inputs["speed"].handled == 2
+
+
+def test_what_was_decided_before_a_kill_is_decided_behind_the_same_samples() -> None:
+    note = LeftOut(node="mix", port="late", reason="dropped", first_seq=7, last_seq=7, stamp=70)
+    lost = LeftOut(node="mix", port="late", reason="lost", first_seq=3, last_seq=4)
+    decided = Decided([WentOn("mix", "late", 20, 2), WasLeftOut(lost), WentOn("mix", "late", 60, 6), WasLeftOut(note)])
+    assert list(decided.passed(1)) == []
+    assert list(decided.passed(5)) == [20]
+    assert list(decided.passed(9)) == [60]
+    imu = Imu(stamp=70, gyro=(0.0, 0.0, 0.0))
+    reasons = [decided.reason(msgspec.structs.replace(imu, stamp=10 * seq, seq=seq)) for seq in range(2, 9)]
+    assert reasons == [None, "lost", "lost", None, None, "dropped", None]

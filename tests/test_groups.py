@@ -14,6 +14,7 @@ from caneflow.runtime.dataflow.loading import examine, load
 from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.hosts.attached.attach import attached, statuses
+from caneflow.runtime.replays.verification import verify
 from caneflow.runtime.stages.journal import Brought, Journal
 from tests.flows import CANEFLOW, NODES, launchers, node_processes, results, wait_for, write_walk
 
@@ -100,7 +101,7 @@ def test_a_live_group_that_is_killed_goes_on_exactly_and_is_still_nodes(tmp_path
         process = node_processes(launched.process.pid)["both"]
         snapshot = Path(" ".join(process.cmdline()).split()[-1]).with_name("both.snapshot")
         wait_for(snapshot.exists, "a snapshot")
-        wait_for(lambda: _newest(snapshot).stat().st_size > 2000, "samples after it")
+        wait_for(lambda: len(journal(snapshot)) > 2000, "samples after it")
         process.kill()
         launched.wait_for("goes on from its snapshot")
         with attached("summed") as there:
@@ -189,9 +190,13 @@ def recorded(status: FlowStatus) -> int:
     return edge.handled
 
 
-def _newest(snapshot: Path) -> Path:
-    """The file that what the sources bring goes to just now; a new process begins one with its first sample."""
-    return max(snapshot.parent.glob("both.journal.*"), key=lambda path: int(path.suffix[1:]))
+def journal(snapshot: Path) -> bytes:
+    """What the journal holds since the snapshot; a process begins a file with its first sample."""
+    files = sorted(snapshot.parent.glob("both.journal.*"), key=lambda path: int(path.suffix[1:]))
+    try:
+        return files[-1].read_bytes() if files else b""
+    except FileNotFoundError:  # the next snapshot was kept meanwhile
+        return b""
 
 
 def said(path: Path) -> list[str]:
@@ -244,3 +249,81 @@ def test_a_journal_is_read_up_to_what_the_kill_tore(tmp_path: Path) -> None:
     assert list(again.since(second)) == brought[1:], "the new process writes a file of its own"
     again.forget(second)
     assert list(again.since(0)) == brought[1:]
+
+
+LATE = """
+import time
+from caneflow.messages import Imu
+from caneflow.runtime import Quiet, Source, run
+
+class Late(Source):
+    outputs = {"imu": Imu}
+
+    def __init__(self, settings, context): ...
+
+    def samples(self):
+        held = []
+        while True:
+            time.sleep(0.01)
+            now = time.time_ns()
+            held.append(Imu(stamp=now, gyro=(float(now % 1009), 0.0, 0.0)))
+            if now // 250_000_000 % 2 == 0:
+                yield from (("imu", sample) for sample in held)
+                held = []
+
+if __name__ == "__main__":
+    run(Late)
+"""
+MIX = """
+from caneflow.messages import Imu
+from caneflow.runtime import Operator, run
+
+class Mix(Operator):
+    inputs = {"quick": Imu, "late": Imu}
+    outputs = {"imu": Imu}
+
+    def __init__(self, settings, context):
+        self.total = 0.0
+
+    def handle(self, port, message):
+        self.total = (self.total * 31.0 + message.gyro[0]) % 1000003.0
+        if port == "quick":
+            yield "imu", Imu(stamp=message.stamp, gyro=(self.total, 0.0, 0.0))
+
+if __name__ == "__main__":
+    run(Mix)
+"""
+
+
+def test_a_group_decides_after_a_kill_as_before_whom_it_did_not_wait_for(tmp_path: Path) -> None:
+    for name, text in {"device": DEVICE, "late": LATE, "mix": MIX}.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    flow, out = tmp_path / "flow.yaml", tmp_path / "out.mcap"
+    flow.write_text(
+        "flow: mixed\nnodes:\n"
+        "  device: {run: device.py, process: both}\n"
+        "  mix:\n"
+        "    run: mix.py\n"
+        "    process: both\n"
+        "    inputs: {quick: device/imu, late: {from: late/imu, max_lag_ms: 60}}\n"
+        "  late: {run: late.py}\n"
+        "results: [mix/imu]\n"
+    )
+    with launchers() as launch:
+        launched = launch("run", flow, "--record", out, log=tmp_path / "log")
+        launched.wait_for("ready: 4 nodes")
+        process = node_processes(launched.process.pid)["both"]
+        snapshot = Path(" ".join(process.cmdline()).split()[-1]).with_name("both.snapshot")
+        wait_for(snapshot.exists, "a snapshot")
+        wait_for(lambda: b"left out" in journal(snapshot), "a decision after it")
+        wait_for(lambda: len(journal(snapshot)) > 8000, "samples after it")
+        process.kill()
+        launched.wait_for("goes on from its snapshot")
+        with attached("mixed") as there:
+            before = recorded(*statuses(there.session, "mixed"))
+            wait_for(lambda: recorded(*statuses(there.session, "mixed")) > before + 100, "samples after the kill")
+        launched.process.send_signal(signal.SIGINT)
+        assert launched.ends() == 130, launched.said
+    (verdict,) = verify(load(flow), out).verdicts
+    assert verdict.holds, f"{verdict.first}\n{launched.said}"
+    assert verdict.recorded > 300

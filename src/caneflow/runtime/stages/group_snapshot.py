@@ -1,6 +1,6 @@
 """The state of a whole group between two samples, as bytes and back."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -68,10 +68,11 @@ class GroupState:
             )
         )
 
-    def resume(self, data: bytes, *, live: bool) -> int:
-        """Go on where `data` was taken; the number of the journal's file that follows. Raises SnapshotError.
+    def resume(self, data: bytes, decide: Callable[[int], None], *, live: bool) -> None:
+        """Go on where `data` was taken; raises SnapshotError.
 
-        `live`: sources go on with their numbers; those of a replay begin again.
+        `decide`: takes the number of the journal's file that follows, before any sample is taken. `live`: sources go on
+        with their numbers; those of a replay begin again.
         """
         try:
             snapshot = msgspec.msgpack.decode(data, type=GroupSnapshot)
@@ -89,10 +90,10 @@ class GroupState:
             for name, source in snapshot.sources.items():
                 self._group.feeds[name].resume(source)
                 self._keep(name, snapshot.history[name])
+        decide(snapshot.journal)
         for name, ports in snapshot.waiting.items():
             for port, payloads in ports.items():
                 self._let_wait(name, port, payloads)
-        return snapshot.journal
 
     def _require_ours(self, snapshot: GroupSnapshot) -> None:
         if (snapshot.layout, snapshot.version) != (LAYOUT, caneflow.__version__):

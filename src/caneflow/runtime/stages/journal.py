@@ -1,4 +1,4 @@
-"""What the sources of a group brought since its last snapshot, in a file that outlives a kill.
+"""What the sources of a group brought, and what it decided by the clock, since its last snapshot: it outlives a kill.
 
 The system keeps what was written, whatever becomes of the process: it does not have to reach the disk for that.
 """
@@ -10,9 +10,11 @@ import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 import msgspec
+
+from caneflow.runtime.stages.decisions import Decision, WasLeftOut, WentOn
 
 log = logging.getLogger(__name__)
 
@@ -20,12 +22,15 @@ LARGEST = 64 * 2**20  # bytes of one file: while no snapshot can be written, no 
 LENGTH = struct.Struct("<I")
 
 
-class Brought(NamedTuple):
+class Brought(msgspec.Struct, frozen=True, array_like=True, tag="brought", gc=False):
     """A sample that a source brought, under its number."""
 
     node: str
     port: str
     payload: bytes
+
+
+Record: TypeAlias = Brought | Decision
 
 
 class Journal:
@@ -42,11 +47,11 @@ class Journal:
             self._folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         self.number = max(self._numbers(), default=-1) + 1  # of the file that is written
 
-    def append(self, brought: Brought) -> None:
-        """Keep a sample that is about to be handled; a disk without room is said once."""
+    def append(self, what: Record) -> None:
+        """Keep a sample that is about to be handled, or a decision; a disk without room is said once."""
         if self._failed or self._size > LARGEST or self._folder < 0:
             return
-        record = msgspec.msgpack.encode(brought)
+        record = msgspec.msgpack.encode(what)
         try:
             if self._file < 0:
                 flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
@@ -71,21 +76,21 @@ class Journal:
                 with suppress(OSError):
                     os.unlink(self._called(number), dir_fd=self._folder)
 
-    def since(self, number: int) -> Iterator[Brought]:
+    def since(self, number: int) -> Iterator[Record]:
         """What the files from `number` on hold, in order, up to a record that was torn by the kill."""
         for each in sorted(self._numbers()):
             if each >= number:
                 with suppress(OSError, msgspec.DecodeError):
                     yield from self._records(self._read(each))
 
-    def _records(self, data: bytes) -> Iterator[Brought]:
+    def _records(self, data: bytes) -> Iterator[Record]:
         at = 0
         while at + LENGTH.size <= len(data):
             (length,) = LENGTH.unpack_from(data, at)
             at += LENGTH.size
             if at + length > len(data):
                 return
-            yield msgspec.msgpack.decode(data[at : at + length], type=Brought)
+            yield msgspec.msgpack.decode(data[at : at + length], type=Brought | WentOn | WasLeftOut)
             at += length
 
     def _read(self, number: int) -> bytes:

@@ -5,7 +5,7 @@ emits is numbered. Nothing here knows Zenoh, processes or a clock.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, TypeAlias
 
 import msgspec
@@ -17,7 +17,8 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.program import Operator, Refused
 from caneflow.runtime.stages.byte_budget import share, weight_of
-from caneflow.runtime.stages.merge import END, Merge
+from caneflow.runtime.stages.decisions import Decided, WentOn
+from caneflow.runtime.stages.merge import BEGIN, END, Merge
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.rollback import Rollback, blames_sample, let_overflow_raise
 from caneflow.runtime.stages.streams import Arrivals, Departures
@@ -46,6 +47,7 @@ class Stage:
         self.inputs = {port: Arrivals(node, port, plan) for port, plan in inputs.items()}
         self.outputs = {port: Departures(plan) for port, plan in outputs.items()}
         self.finished = False
+        self.caught_up_at = BEGIN  # ns: after a kill, up to here neither age nor length decides again
         self._awaited = [out for out in self.outputs.values() if out.plan.awaited]
         self._operator = operator
         self._rollback = Rollback(node, operator)
@@ -107,7 +109,21 @@ class Stage:
 
     def go_on_without(self, port: str, until: int) -> None:
         """Wait for `port` no longer up to the stamp `until` (ns): what it still brings there is late."""
+        arrivals = self.inputs[port]
+        if arrivals.keep is not None and until > self._merge.watermark(port):
+            arrivals.keep(WentOn(self.node, port, until, arrivals.expected))
         self._merge.advance(port, until)
+
+    def went_on(self) -> Iterator[WentOn]:
+        """How far inputs have passed beyond what came on them."""
+        for port, arrivals in self.inputs.items():
+            if arrivals.last_stamp < self._merge.watermark(port) < END - 1:
+                yield WentOn(self.node, port, self._merge.watermark(port), arrivals.expected)
+
+    def decide_again(self, port: str, decided: Decided) -> None:
+        """Decide of `port` as before a kill, from which the stage has been resumed."""
+        self.inputs[port].decided = decided
+        self._count_mark(port, self.inputs[port])
 
     def held_by(self) -> str | None:
         """The port that the next sample waits for."""
@@ -135,7 +151,7 @@ class Stage:
         `now` as in `step`. None: it is not so simple, and nothing was done.
         """
         arrivals = self.inputs[port]
-        if arrivals.plan.left_out or not arrivals.is_simply_next(message):
+        if arrivals.plan.left_out or arrivals.decided is not None or not arrivals.is_simply_next(message):
             return None
         if not self._merge.pass_by(port, message.stamp):
             return None
@@ -207,6 +223,8 @@ class Stage:
 
     def _queue(self, port: str, arrivals: Arrivals, message: Sample) -> None:
         """Let a sample that is next in its stream wait for its turn in event time."""
+        if arrivals.decided is not None and self._is_left_out_again(port, arrivals, arrivals.decided, message):
+            return
         if message.stamp in arrivals.plan.left_out_stamps:
             arrivals.counts.left_out += 1
             arrivals.note_handled(message)
@@ -221,11 +239,24 @@ class Stage:
                 self._held[port] += weight_of(message)
             self._keep_length(port, arrivals)
 
+    def _is_left_out_again(self, port: str, arrivals: Arrivals, decided: Decided, message: Sample) -> bool:
+        for until in decided.passed(message.seq):
+            self._merge.advance(port, until)
+        reason = decided.reason(message)
+        if reason is None:
+            return False
+        arrivals.counts.dropped += reason == "dropped"
+        arrivals.counts.late += reason != "dropped"
+        arrivals.note_handled(message)
+        arrivals.leave_out(message, reason)
+        self._merge.advance(port, message.stamp)
+        return True
+
     def _handled(
         self, port: str, arrivals: Arrivals, message: Sample, now: int | None
     ) -> list[tuple[str, Sample, int]]:
         arrivals.note_handled(message, now)
-        if now is not None and arrivals.too_old(message, now):
+        if now is not None and message.stamp > self.caught_up_at and arrivals.too_old(message, now):
             arrivals.counts.dropped += 1
             arrivals.leave_out(message, "dropped")
             return []
@@ -270,9 +301,11 @@ class Stage:
 
     def _keep_length(self, port: str, arrivals: Arrivals) -> None:
         length, budget = arrivals.plan.length, self._budget
-        while (length is not None and self._merge.waiting(port) > length) or (
-            budget is not None and self._held[port] > budget and self._merge.waiting(port) > 1
-        ):
+        while (
+            length is not None
+            and self._merge.waiting(port) > length
+            and self._merge.samples(port)[0].stamp > self.caught_up_at
+        ) or (budget is not None and self._held[port] > budget and self._merge.waiting(port) > 1):
             oldest = self._merge.drop_oldest(port)
             if budget is not None:
                 self._held[port] -= weight_of(oldest)
@@ -280,5 +313,8 @@ class Stage:
             arrivals.counts.dropped += 1
 
     def _count_mark(self, port: str, arrivals: Arrivals) -> None:
+        if arrivals.decided is not None:
+            for until in arrivals.decided.passed(arrivals.expected):
+                self._merge.advance(port, until)
         if arrivals.mark is not None and (watermark := arrivals.arrived_mark()) is not None:
             self._merge.advance(port, watermark)

@@ -3,6 +3,7 @@
 import logging
 import re
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from caneflow.messages import MessageError, Sample
@@ -10,6 +11,7 @@ from caneflow.messages.control import InputCounts, LeftOut, PortMark
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.plan import InputPlan, OutputPlan
 from caneflow.runtime.stages.byte_budget import WAITING, weight_of
+from caneflow.runtime.stages.decisions import Decided, Decision, WasLeftOut
 from caneflow.runtime.stages.merge import BEGIN, END
 
 log = logging.getLogger(__name__)
@@ -41,6 +43,8 @@ class Arrivals:
     unreadable: int = 0  # refused samples whose seq is not known: they are not lost as well
     left_out: deque[LeftOut] = field(default_factory=lambda: deque(maxlen=NOTES_KEPT))  # a live host tells them
     clock_offset: int | None = 0  # ns, the writer's clock less this machine's; None: not known
+    keep: Callable[[Decision], None] | None = None  # takes what is decided of this input, before anything follows
+    decided: Decided | None = None  # before a kill
     patient: bool = False  # what is missing can be had again: later samples wait for it
     ahead: dict[int, Sample] = field(default_factory=dict)  # those that wait, by seq
     handled_seq: int = -1  # of the last sample that needs no asking for
@@ -222,15 +226,9 @@ class Arrivals:
 
     def leave_out(self, message: Sample, reason: str) -> None:
         """Note a sample that came and is not handled."""
-        self.left_out.append(
-            LeftOut(
-                node=self.node,
-                port=self.port,
-                reason=reason,
-                first_seq=message.seq,
-                last_seq=message.seq,
-                stamp=message.stamp,
-            )
+        seq = message.seq
+        self._note(
+            LeftOut(node=self.node, port=self.port, reason=reason, first_seq=seq, last_seq=seq, stamp=message.stamp)
         )
 
     def _note_lost(self, before: int) -> None:
@@ -239,9 +237,14 @@ class Arrivals:
         if count > 0:
             self.counts.lost += count
             self._say_once("lost", f"{count} samples lost before seq {before}")
-            self.left_out.append(
+            self._note(
                 LeftOut(node=self.node, port=self.port, reason="lost", first_seq=self.expected, last_seq=before - 1)
             )
+
+    def _note(self, note: LeftOut) -> None:
+        if self.keep is not None:
+            self.keep(WasLeftOut(note))
+        self.left_out.append(note)
 
     def _note_silence(self, message: Sample) -> None:
         """Say how long nothing was measured, or what was is lost, before `message`."""

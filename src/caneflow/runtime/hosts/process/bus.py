@@ -223,6 +223,11 @@ class Bus:
         """Publish how far a node has come to those of its readers that wait for it."""
         self._words["marks", progress.node].put(encode(progress))
 
+    @property
+    def hears_left_out(self) -> bool:
+        """Whether anybody hears what is said to be left out: a recorder may not be linked yet after a kill."""
+        return bool(self._late.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+
     def send_left_out(self, note: LeftOut) -> None:
         """Publish that a sample was not handled."""
         self._late.put(encode(note))

@@ -12,9 +12,11 @@ from caneflow.runtime.hosts.process.outputs import Outputs
 from caneflow.runtime.hosts.process.recovery import SNAPSHOT_PERIOD, Recovery
 from caneflow.runtime.plan import ProcessPlan
 from caneflow.runtime.stages.byte_budget import weight
+from caneflow.runtime.stages.decisions import Decided, Decision
 from caneflow.runtime.stages.group import Group
 from caneflow.runtime.stages.group_snapshot import GroupState
-from caneflow.runtime.stages.journal import Brought, Journal
+from caneflow.runtime.stages.journal import Brought, Journal, Record
+from caneflow.runtime.stages.merge import BEGIN, END
 from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.references import SnapshotError
 from caneflow.runtime.stages.snapshot_file import SnapshotFile
@@ -42,9 +44,13 @@ class GroupRecovery:
         self._lock = lock
         self._state = GroupState(group, {name: each.history for name, each in outputs.items()}, snapshots)
         self._file = SnapshotFile(snapshots)
-        journals = not plan.replay and bool(group.feeds)
-        self._journal = Journal(snapshots.with_suffix(".journal")) if journals else None
-        self._resume_at = 0  # of the journal
+        self._stages = {name: each for name, each in group.readers.items() if isinstance(each, Stage)}
+        self._journal = None if plan.replay else Journal(snapshots.with_suffix(".journal"))
+        if self._journal is not None:
+            for stage in self._stages.values():
+                for arrivals in stage.inputs.values():
+                    arrivals.keep = self._journal.append
+        self._since: list[Record] = []  # of the journal, since the snapshot that was gone on from
         self._confirmed: dict[str, dict[str, int]] = {}  # by node and input key what the last snapshot has handled
         budgets = [wire.budget for wire in plan.arriving.values()]
         self._snapshot_bytes = min(budgets) // 2 if budgets else math.inf
@@ -80,6 +86,8 @@ class GroupRecovery:
                 self._group.idle(time.time_ns())  # what sinks have taken up to here is not brought again
             number = self._journal.begin() if fresh and self._journal is not None else 0
             snapshot = self._state.taken(number) if fresh else None
+            if fresh:
+                self._keep_went_on()
         self._keeps = not fresh or self._is_kept(snapshot)  # without the lock: samples do not wait for the disk
         if self._keeps:
             self._last = stand
@@ -97,7 +105,7 @@ class GroupRecovery:
             data = self._file.read()
             if data is None:
                 return False
-            self._resume_at = self._state.resume(data, live=not self._plan.replay)
+            self._state.resume(data, self._decide_again, live=not self._plan.replay)
         except SnapshotError as error:
             log.warning("starts without its snapshot, which cannot be used: %s", one_line(error))
             self._forget()
@@ -107,8 +115,38 @@ class GroupRecovery:
         return True
 
     def brought_since(self) -> Iterable[Brought]:
-        """What the sources of the process before this one brought after its snapshot."""
-        return [] if self._journal is None else list(self._journal.since(self._resume_at))
+        """What the sources of the process before this one brought after its snapshot.
+
+        Until all of it has come again, nothing is decided by the clock.
+        """
+        since, self._since = self._since, []
+        yield from (each for each in since if isinstance(each, Brought))
+        newest = max(
+            (last for feed in self._group.feeds.values() for _, last in feed.state().outputs.values()), default=BEGIN
+        )
+        for stage in self._stages.values():
+            stage.caught_up_at = min(stage.caught_up_at, newest)
+
+    def _decide_again(self, number: int) -> None:
+        """Decide as the process before this one has since the journal's file `number`: what followed was published."""
+        if self._journal is None:
+            return
+        self._since = list(self._journal.since(number))
+        decisions: dict[tuple[str, str], list[Decision]] = {}
+        for each in self._since:
+            if not isinstance(each, Brought):
+                decisions.setdefault((each.node, each.port), []).append(each)
+        for name, stage in self._stages.items():
+            stage.caught_up_at = END
+            for port in stage.inputs:
+                if (name, port) in decisions:
+                    stage.decide_again(port, Decided(decisions[name, port]))
+
+    def _keep_went_on(self) -> None:
+        """Keep how far inputs have passed beyond their samples: a snapshot does not have it."""
+        for went_on in (each for stage in self._stages.values() for each in stage.went_on()):
+            if self._journal is not None:
+                self._journal.append(went_on)
 
     def confirmed_by(self, node: str) -> dict[str, int]:
         """By input key the last seq that a node will not ask for again."""

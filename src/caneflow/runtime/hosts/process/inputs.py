@@ -15,11 +15,14 @@ from caneflow.runtime.hosts.process.reports import LIVE_REPORT_PERIOD, REPORT_PE
 from caneflow.runtime.plan import InputPlan, NodePlan, ProcessPlan
 from caneflow.runtime.stages.byte_budget import WAITING
 from caneflow.runtime.stages.group import Group
+from caneflow.runtime.stages.merge import BEGIN
+from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.sink_stage import Tap
 from caneflow.runtime.stages.streams import AHEAD_KEPT, Arrivals
 
 ASK_PERIOD = 0.3  # s between two requests for samples that have not come
 LIVE_PATIENCE = 1.0  # s that later samples wait for them in a live run, while their writer sends and does not answer
+RESUME_PATIENCE = 3.0  # s that a group which goes on after a kill waits for what had come, whatever an input's lag
 SILENT_PATIENCE = 10.0  # s, likewise, while it does neither: it may be busy, and nothing else comes that has to wait
 REPLAY_PATIENCE = 60.0  # s, likewise in a replay: nothing is to be lost, and its writer may be coming back
 
@@ -74,6 +77,7 @@ class Inputs:
             for port, wire in plan.inputs.items()
             if wire.max_lag_ms is not None and plan.outputs and not plan.replay
         }
+        self._begun = time.monotonic()  # s
         self._reader.bound(WAITING)
         for port, arrivals in self._reader.inputs.items():
             arrivals.patient = port in arriving and not arriving[port].external
@@ -194,11 +198,19 @@ class Inputs:
         for port, others in self._others.items():
             limit = self._plan.inputs[port].max_lag_ms or 0.0
             until = None
-            while others and (now - others[0][0]) * 1e3 > limit:
+            awaited = self._awaited_again_until(port, now)
+            while others and (now - others[0][0]) * 1e3 > limit and others[0][1] > awaited:
                 _, until = others.popleft()
             if until is not None:
                 found.append((port, until))
         return found
+
+    def _awaited_again_until(self, port: str, now: float) -> int:
+        """After a kill, the stamp (ns) up to which the clock does not decide: what had come has been asked for."""
+        coming = port in self._unanswered or self.has_gap(port)
+        if not (isinstance(self._reader, Stage) and coming and now < self._begun + RESUME_PATIENCE):
+            return BEGIN
+        return self._reader.caught_up_at
 
     def count_dropped(self) -> None:
         """Count the samples for which the inbox had no room."""

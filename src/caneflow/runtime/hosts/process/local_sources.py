@@ -114,7 +114,8 @@ class LocalSources:
 
     def catch_up(self, brought: Iterable[journal.Brought]) -> None:
         """Handle once more what the process before this one had brought after its snapshot; with the lock held."""
-        for node, port, payload in brought:
+        for each in brought:
+            node, port, payload = each.node, each.port, each.payload
             kind = self._feeds[node].outputs[port].plan.kind
             message = decode(payload, kind)
             again = self._feeds[node].take(port, Encoded(kind, message.stamp, message.seq, payload))

@@ -116,7 +116,7 @@ class Sayings:
                 self.reports[name].marks(stage.progress())
 
     def what_was_left_out(self, name: str) -> None:
-        """Say what a node did not handle."""
-        if name in self._stages:
+        """Say what a node did not handle, once somebody hears it."""
+        if name in self._stages and self._bus.hears_left_out:
             for note in self._stages[name].left_out():
                 self._bus.send_left_out(note)
