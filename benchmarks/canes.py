@@ -7,10 +7,10 @@ recorder, as five processes, as a group beside its recorder, or as one group wit
 
 import argparse
 import json
+import math
 import re
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -24,6 +24,7 @@ from benchmarks.contenders import CANEFLOW, HERE
 from benchmarks.measuring import cpu_ns, family
 from caneflow.recording import Recording
 
+READY_PATIENCE = 60.0  # s
 LAYOUTS = {  # what a cane's nodes share
     "five processes": "",
     "group, recorder": ", process: cane",
@@ -42,6 +43,10 @@ nodes:
     {run: operators.fusion, inputs: {imu: imu/imu, speed: ground_speed/speed}, settings: {method: {method}}{process}}
 results: [fusion/pose]
 """
+
+
+class EndedByItselfError(Exception):
+    """A flow did not come up, or did not go on: nothing was measured."""
 
 
 def main() -> None:
@@ -85,6 +90,7 @@ def graph(walk: Path, method: str, layout: str = "five processes") -> str:
 def measured(folder: Path, text: str, canes: int, seconds: float) -> dict[str, object]:
     """Losses, ages and cost of `canes` flows, of which `text` is the file."""
     with running(folder, text, canes) as launchers:
+        wait_until_ready(folder, canes)
         time.sleep(WARM_UP)
         nodes = [pid for launcher in launchers for pid in nodes_of(launcher)]
         begin, before = time.time_ns(), cpu_ns(nodes)
@@ -97,10 +103,10 @@ def measured(folder: Path, text: str, canes: int, seconds: float) -> dict[str, o
         with Recording(path) as recording:
             found = [(s.seq, s.stamp, s.log_time) for s in recording.samples([("fusion", "pose")])]
         seqs = [seq for seq, _, _ in found]
-        missing += seqs[-1] - seqs[0] + 1 - len(set(seqs))
+        missing += seqs[-1] - seqs[0] + 1 - len(set(seqs)) if seqs else 1
         poses += len(seqs)
         ages += [(taken - stamp) * 1e-6 for _, stamp, taken in found if begin < stamp < end]
-    p50, p99, worst = np.percentile(ages, (50, 99, 100)).round(2)
+    p50, p99, worst = np.percentile(ages or [math.inf], (50, 99, 100)).round(2)
     return {
         "canes": canes,
         "poses": poses,
@@ -110,6 +116,15 @@ def measured(folder: Path, text: str, canes: int, seconds: float) -> dict[str, o
         "cpu_of_a_cane_percent": round((after - before) / (end - begin) / canes * 100, 1),
         "memory_of_a_cane_mb": round(memory / canes / 1e6, 1),
     }
+
+
+def wait_until_ready(folder: Path, canes: int) -> None:
+    """Wait until all nodes of all canes are there: on a full machine that takes longer than the warm-up."""
+    deadline = time.monotonic() + READY_PATIENCE
+    while sum("ready: " in path.read_text() for path in folder.glob("*.log")) < canes:
+        if time.monotonic() > deadline:
+            raise EndedByItselfError(f"not ready after {READY_PATIENCE:g} s")
+        time.sleep(0.1)
 
 
 def nodes_of(launcher: int) -> list[int]:
@@ -140,7 +155,7 @@ def running(folder: Path, text: str, canes: int) -> Iterator[list[int]]:
             each.send_signal(signal.SIGINT)
         ends = {each.wait(60) for each in started}
     if ends != {130}:
-        sys.exit(f"a flow ended by itself: {ends}")
+        raise EndedByItselfError(f"a flow ended by itself: {ends}")
 
 
 if __name__ == "__main__":

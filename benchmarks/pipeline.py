@@ -97,9 +97,17 @@ def side_by_side(walk: Path, number: int, layout: str = "five processes") -> dic
 def most_canes(walk: Path, layout: str) -> int:
     """How many canes this machine holds with nothing lost and no pose late: one more at a time, until it fails."""
     held = 0
-    while held < MOST_CANES and holds(side_by_side(walk, held + 1, layout)):
+    while held < MOST_CANES and is_held(walk, held + 1, layout):
         held += 1
     return held
+
+
+def is_held(walk: Path, number: int, layout: str) -> bool:
+    """Whether this machine holds so many canes; one whose flows do not come up does not."""
+    try:
+        return holds(side_by_side(walk, number, layout))
+    except canes.EndedByItselfError:
+        return False
 
 
 def holds(run: Mapping[str, object]) -> bool:

@@ -1,22 +1,23 @@
 """Several nodes in one process: the same bytes as in one each, exact after a kill, still nodes to the outside."""
 
 import signal
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
+from caneflow.errors import CaneflowError
 from caneflow.messages import Imu, decode
 from caneflow.messages.control import FlowStatus
 from caneflow.recording import Recording
 from caneflow.runtime.dataflow.loading import examine, load
 from caneflow.runtime.deployment import deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.attached.attach import attached, statuses
+from caneflow.runtime.hosts.attached.asking import restarted
+from caneflow.runtime.hosts.attached.attach import attached, launchers_of, statuses
 from caneflow.runtime.replays.verification import verify
 from caneflow.runtime.stages.journal import Brought, Journal
-from tests.flows import CANEFLOW, NODES, launchers, node_processes, results, wait_for, write_walk
+from tests.flows import NODES, launchers, node_processes, results, wait_for, write_walk
 
 DEVICE = """
 import itertools, time
@@ -153,9 +154,8 @@ def test_in_a_replay_the_process_of_the_recorder_is_never_started_again(tmp_path
     with launchers() as launch:
         launched = launch("run", flow, "--replay", walk, "--record", tmp_path / "out.mcap", log=tmp_path / "log")
         launched.wait_for("ready: 5 nodes")
-        refused = caneflow("restart", "recorded", "fusion")
-        assert (refused.returncode, refused.stdout) == (2, "")
-        assert "the recording of a replay is its result" in refused.stderr
+        with pytest.raises(CaneflowError, match="fusion: not started again: the recording of a replay is its result"):
+            restarted(launchers_of("recorded"), "fusion")
         node_processes(launched.process.pid)["recorder"].kill()
         assert launched.ends() == 1, launched.said
         assert "killed by SIGKILL: not started again: the recording of a replay is its result" in launched.said
@@ -173,16 +173,13 @@ def test_a_group_in_a_replay_that_is_asked_to_restart_computes_the_same_bytes(tm
         launched = launch("run", flow, "--replay", walk, "--record", out, log=tmp_path / "log")
         launched.wait_for("ready: 5 nodes")
         before = node_processes(launched.process.pid)
-        assert "asked: fusion is ready again" in caneflow("restart", "asked", "fusion").stdout
+        again = restarted(launchers_of("asked"), "fusion")
         after = node_processes(launched.process.pid)
         assert launched.ends() == 0, launched.said
     assert after.keys() == before.keys() == {"cane", "recorder"}
-    assert {name for name in before if after[name].pid != before[name].pid} == {"cane"}, "it restarts as one"
+    assert after["cane"].pid == again.pid != before["cane"].pid, "it restarts as one"
+    assert after["recorder"].pid == before["recorder"].pid
     assert results(out) == results(alone)
-
-
-def caneflow(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*CANEFLOW, *arguments], capture_output=True, text=True, timeout=60, check=False)
 
 
 def recorded(status: FlowStatus) -> int:
