@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from caneflow import command
 from caneflow.algorithms.judging.track_errors import track_errors
-from caneflow.messages import DopplerBlock, GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
+from caneflow.messages import DopplerBlock, Grid, GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered
 from caneflow.recording import RecordingWriter
 from caneflow.viewing.sensor_pictures import euler_angles
 from tools.plot import read_picture, summary
@@ -237,3 +237,30 @@ def test_a_recording_with_nothing_to_draw_says_so(caneflow: Callable[..., Run], 
 def test_another_kind_of_picture_is_refused_before_the_work(caneflow: Callable[..., Run], tmp_path: Path) -> None:
     said = caneflow("plot", tmp_path / "walk.mcap", "-o", tmp_path / "walk.gif")
     assert said == (2, "", f"caneflow plot: {tmp_path / 'walk.gif'}: a picture is one of .png, .svg, .pdf\n")
+
+
+def test_a_grid_is_drawn_where_its_cells_are(tmp_path: Path) -> None:
+    occupancy, missing = np.full((2, 8, 8), 128, np.uint8), np.full((8, 8), 128, np.uint8)
+    occupancy[1, 5, 6] = 128 + 40
+    occupancy[0, 2, 2] = 128 + 39  # one count too few
+    missing[7, 0] = 128 + 40
+    grid = Grid(
+        stamp=10**9,
+        occupancy=occupancy,
+        floor_missing=missing,
+        unit=1 / 32,
+        cell=0.1,
+        bottom=0.0,
+        slice=0.25,
+        origin=(15, -2),
+        pose_stamp=10**9,
+    )
+    samples: list[tuple[str, Sample]] = [
+        *(("cane/fusion/pose", pose(10**9 + i, 0.0, 0.0, 0.0, "best")) for i in range(2)),
+        ("cane/surroundings/grid", grid),
+    ]
+    picture = read_picture(write(tmp_path / "grid.mcap", samples))
+    assert picture.occupied is not None
+    assert picture.floor_missing is not None
+    np.testing.assert_allclose(picture.occupied, [[2.05, 0.45]])
+    np.testing.assert_allclose(picture.floor_missing, [[2.25, -0.15]])

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, numbered, sample_key
+from caneflow.messages import Cue, GroundSpeed, Imu, Obstacles, Pose, RadarFrame, Sample, numbered, sample_key
 from caneflow.messages.rig import Rig
 from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.recording import RecordingWriter
@@ -439,3 +439,18 @@ def test_the_page_asks_for_nothing_from_elsewhere() -> None:
             assert "https://" not in text, file
             assert "http://" not in text, file
     assert json.dumps((page / "uplot-LICENSE.txt").read_text()).count("Leon Sorokin") == 1
+
+
+def test_obstacles_and_cues_keep_their_numbers() -> None:
+    nearest, known = np.zeros((3, 4), np.float32), np.ones((3, 4), np.float32)
+    nearest[1, 2], known[0, 3] = 2.5, 0.125
+    obstacles = Obstacles(stamp=1, heading=0.5, walking=True, nearest=nearest, known=known)
+    row = dict(zip(COLUMNS[Obstacles], row_of(obstacles, BORESIGHT), strict=True))
+    assert (row["heading"], row["walking"]) == (0.5, 1.0)
+    assert {name: value for name, value in row.items() if value == 2.5} == {"ahead_head": 2.5}
+    assert row["known_left_drop"] == 0.125
+    cue = Cue(stamp=1, kind="obstacle", level="head", distance=2.5, azimuth=0.1, urgency=0.2, since=1)
+    assert row_of(cue, BORESIGHT) == (1.0, 2.0, 2.5, 0.1, 0.2)
+    kind, *rest = row_of(Cue(stamp=1, kind="blind", reason="pose: no sample", since=1), BORESIGHT)
+    assert kind == 3.0
+    assert all(math.isnan(each) for each in rest)

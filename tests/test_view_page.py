@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, decode, numbered, sample_key
+from caneflow.messages import Cue, GroundSpeed, Imu, Obstacles, Pose, RadarFrame, Sample, decode, numbered, sample_key
 from caneflow.messages.rig import Rig
 from caneflow.recording import RecordingWriter
 from caneflow.runtime.hosts.attached.attach import ANY, Heard, attached
@@ -321,6 +321,28 @@ def test_an_uncertain_position_is_said_to_be(shown: tuple[Page, LiveStreams]) ->
     assert page.eval_on_selector("#at-sure", "place => getComputedStyle(place).textDecorationStyle") == "dashed"
     page.keyboard.press("w")
     until(lambda: "This is uncertain, by 6.0 metres." in page.inner_text("#words"))
+
+
+def test_what_stands_around_is_a_table_and_words(shown: tuple[Page, LiveStreams]) -> None:
+    page, streams = shown
+    assert page.locator("#obstacles-card").is_hidden()
+    nearest, known = np.zeros((3, 4), np.float32), np.ones((3, 4), np.float32)
+    nearest[1, 2], nearest[0, 0], known[2, 3] = 2.3, 0.8, 0.1
+    stamp = 3_000_000_000
+    found = Obstacles(stamp=stamp, heading=0.0, walking=True, nearest=nearest, known=known)
+    cue = Cue(stamp=stamp, kind="obstacle", level="head", distance=2.3, azimuth=0.0, urgency=0.4, since=stamp)
+    streams.take("surroundings/obstacles", found, stamp)
+    streams.take("surroundings/cue", cue, stamp)
+    walk(streams, 100)
+    said = "Told of: head, 2.3 m ahead. Beside, left: low 0.8 m; right: nothing."
+    until(lambda: page.inner_text("#obstacles-words") == said)
+    rows = [row.split() for row in page.inner_text("#obstacles").splitlines()]
+    none = "\N{EN DASH}"
+    assert rows == [
+        ["left", "0.8", "m", none, none, none],
+        ["ahead", none, none, "2.3", "m", none],
+        ["right", none, none, none, "?"],
+    ]
 
 
 def test_a_position_that_does_not_come_any_more_is_said_to_be_old(shown: tuple[Page, LiveStreams]) -> None:

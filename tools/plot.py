@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from caneflow.algorithms.judging.track_errors import START_NS, Track, boresight_yaws, track_errors
 from caneflow.algorithms.rotations import Vector
 from caneflow.errors import CaneflowError, not_installed
-from caneflow.messages import DopplerBlock, GroundSpeed, Imu, Pose, RadarFrame
+from caneflow.messages import DopplerBlock, Grid, GroundSpeed, Imu, Pose, RadarFrame
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
 from caneflow.printable import printable
@@ -50,6 +50,8 @@ MOST_TRACKS = 20  # more cannot be told apart
 
 MOST_MODULES = 4  # Doppler modules below each other
 DYNAMIC_RANGE = 35.0  # dB
+LIKELY = 1.25  # nat, from which a cell of a grid counts as occupied: two hits
+MOST_CELLS = 200_000
 DOPPLER = "Doppler, m/s (approaching)"
 
 
@@ -68,6 +70,10 @@ class Picture:
     radar: RadarPictures | None = None
     modules: dict[str, DopplerPicture] = field(default_factory=dict)  # by node/port
     imu: ImuPicture | None = None  # only where nothing else is
+    occupied: Floats | None = (
+        None  # (n, 2) m: cells in which a grid of the recording has something, in its poses' frame
+    )
+    floor_missing: Floats | None = None  # (n, 2) m likewise
 
     def seconds(self, track: Track) -> Floats:
         """Times (s) of a track's poses."""
@@ -76,14 +82,18 @@ class Picture:
 
     def aligned(self, track: Track) -> Floats:
         """Positions (n, 2) m of a track laid on the truth: at its start and by its yaw there, as errors are."""
+        return self.laid(track.positions[:, :2], track)
+
+    def laid(self, points: Floats, track: Track) -> Floats:
+        """Points (n, 2) m in the frame of a track, moved as the track is."""
         if self.truth is None or self.sensors:
-            return track.positions[:, :2]
+            return points
         count = int(np.searchsorted(track.stamps, track.stamps[0] + START_NS))
         first = int(np.searchsorted(self.truth.stamps, track.stamps[0]))
         true_yaws = boresight_yaws(self.truth.orientations[first : first + count], self.boresight)
         yaws = boresight_yaws(track.orientations[: len(true_yaws)], self.boresight)
         turn = float(np.angle(np.mean(np.exp(1j * (true_yaws - yaws)))))
-        x, y = (track.positions[:, :2] - track.positions[0, :2]).T
+        x, y = (points - track.positions[0, :2]).T
         turned = np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y], axis=1)
         moved: Floats = turned + self.true_positions(track)[0]
         return moved
@@ -188,6 +198,8 @@ def read_picture(path: Path) -> Picture:
             picture.truth_speed = None if picture.sensors else _along_boresight(picture, velocities)
         for stream in recording.streams_of(GroundSpeed)[:MOST_TRACKS]:
             picture.speeds[f"{stream.node}/{stream.port}"] = _speeds(recording, stream, span[0])
+        for stream in recording.streams_of(Grid)[:1] if poses else ():
+            picture.occupied, picture.floor_missing = _grid_cells(recording, stream)
         for stream in recording.streams_of(RadarFrame)[:1]:
             picture.radar = _radar(recording, stream, span[0])
         if not (poses or truth):
@@ -208,6 +220,24 @@ def _add_single_sensors(picture: Picture, recording: Recording) -> None:
     for stream in recording.streams_of(Imu)[:1]:
         samples = [cast(Imu, sample.decoded()) for sample in recording.samples([(stream.node, stream.port)])]
         picture.imu = imu_picture(samples, origin=picture.origin)
+
+
+def _grid_cells(recording: Recording, stream: Stream) -> tuple[Floats, Floats]:
+    """Middles (n, 2) m of the cells that any grid of a stream has as occupied, and as without a floor."""
+    found: tuple[set[tuple[int, int]], set[tuple[int, int]]] = (set(), set())
+    cell = 0.1
+    for sample in recording.samples([(stream.node, stream.port)]):
+        grid = cast(Grid, sample.decoded())
+        planes = (grid.occupancy.max(axis=0), grid.floor_missing)
+        cell = grid.cell
+        for cells, plane in zip(found, planes, strict=True):
+            if plane is not None:
+                likely = np.argwhere((plane.astype(float) - 128.0) * grid.unit >= LIKELY) + np.array(grid.origin)
+                cells.update((int(i), int(j)) for i, j in likely[:MOST_CELLS])
+        if sum(map(len, found)) > MOST_CELLS:
+            break
+    occupied, missing = ((np.array(sorted(cells), np.float64).reshape(-1, 2) + 0.5) * cell for cells in found)
+    return occupied, missing
 
 
 def _radar(recording: Recording, stream: Stream, origin: int) -> RadarPictures | None:
@@ -312,6 +342,7 @@ def _draw_track(axes: "Axes", picture: Picture) -> None:
         x, y = picture.truth.positions[:, :2].T
         axes.plot(x, y, color=FAINT, linewidth=4, solid_capstyle="round", label="truth")
         axes.plot(x[0], y[0], "o", color=INK, markersize=9, markerfacecolor="white", label="start", zorder=5)
+    _draw_grid(axes, picture)
     for (name, track), colour in zip(picture.tracks.items(), COLOURS * len(picture.tracks), strict=False):
         x, y = picture.aligned(track).T
         axes.plot(x, y, color=colour, linewidth=1.6, label=name)
@@ -329,6 +360,17 @@ def _draw_track(axes: "Axes", picture: Picture) -> None:
     axes.legend(loc="best", frameon=False, labelcolor=INK)
     text = "\n".join(line.replace(": ", "\n", 1) for line in summary(picture)) if picture.truth else ""
     axes.set_title(text, loc="left", fontsize=10, color=INK)
+
+
+def _draw_grid(axes: "Axes", picture: Picture) -> None:
+    """What the grids had: squares where something stands, crosses where the floor is missing."""
+    if not picture.tracks:
+        return
+    track = next(iter(picture.tracks.values()))
+    for cells, marker, label in ((picture.occupied, "s", "occupied"), (picture.floor_missing, "x", "floor missing")):
+        if cells is not None and len(cells):
+            x, y = picture.laid(cells, track).T
+            axes.plot(x, y, marker, color=INK if marker == "x" else "#777777", markersize=2.5, label=label, zorder=1)
 
 
 def _draw_speeds(axes: "Axes", picture: Picture) -> None:

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from caneflow.algorithms.rotations import Quaternion, Vector, depression_of, rotate, yaw_of
-from caneflow.messages import DopplerTarget, GroundSpeed, Imu, Pose, Sample
+from caneflow.messages import Cue, DopplerTarget, GroundSpeed, Imu, Obstacles, Pose, Sample
 from caneflow.messages.arrays import Array
 
 Row: TypeAlias = tuple[float, ...]
@@ -16,12 +16,19 @@ NAN = math.nan
 SIGMAS = 2.0  # of the ellipse: it holds the position in 86 % of the cases, if the estimator is honest
 NO_ELLIPSE = (NAN, NAN, NAN)
 
+SECTORS = ("left", "ahead", "right")
+LEVELS = ("low", "waist", "head", "drop")
+CUE_KINDS = ("none", "obstacle", "drop", "blind")  # a row has their number
+PLACES = tuple(f"{sector}_{level}" for sector in SECTORS for level in LEVELS)
+
 # What is not there, or not known, is NaN. The first columns are the wire's own numbers, unchanged.
 COLUMNS: Mapping[type[Sample], tuple[str, ...]] = {
     Imu: ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z", "yaw", "pitch"),
     GroundSpeed: ("speed", "quality", "rays", "valid", "delay"),
     Pose: ("x", "y", "z", "vx", "vy", "vz", "yaw", "major", "minor", "turn"),
     DopplerTarget: ("range_rate", "signed", "amplitude", "snr", "valid", "range"),
+    Obstacles: ("heading", "walking", *PLACES, *(f"known_{place}" for place in PLACES)),
+    Cue: ("kind", "level", "distance", "azimuth", "urgency"),
 }
 
 
@@ -84,9 +91,22 @@ def _target(target: Any, _: Vector) -> Row:
     return target.range_rate, float(target.signed), target.amplitude, target.snr, float(target.valid), distance
 
 
+def _obstacles(obstacles: Any, _: Vector) -> Row:
+    nearest, known = (each.reshape(-1).tolist() for each in (obstacles.nearest, obstacles.known))
+    return obstacles.heading, float(obstacles.walking), *nearest, *known
+
+
+def _cue(cue: Any, _: Vector) -> Row:
+    level = NAN if cue.level is None else float(LEVELS.index(cue.level))
+    told = (NAN if each is None else each for each in (cue.distance, cue.azimuth, cue.urgency))
+    return float(CUE_KINDS.index(cue.kind)), level, *told
+
+
 _ROWS: Mapping[type[Sample], Callable[[Any, Vector], Row]] = {
     Imu: _imu,
     GroundSpeed: _speed,
     Pose: _pose,
     DopplerTarget: _target,
+    Obstacles: _obstacles,
+    Cue: _cue,
 }

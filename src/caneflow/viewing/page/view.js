@@ -3,6 +3,7 @@
 import { Chart } from "./charts.js";
 import { readColours } from "./ink.js";
 import { isUnsure, Plan } from "./plan.js";
+import { ObstaclePicture, obstacleRows, obstaclesInWords } from "./obstacles.js";
 import { RadarMap } from "./radar.js";
 import { named, Series } from "./series.js";
 import { edgeRow, nodeRow, recordedRow, streamRow, Table } from "./tables.js";
@@ -36,6 +37,8 @@ const charts = {
 const targetCharts = new Map();
 const nodes = new Table($("nodes"), 6);
 const edges = new Table($("edges"), 10);
+const obstacles = new Table($("obstacles"), 4);
+const obstaclePicture = new ObstaclePicture($("obstacles-picture"));
 
 let state = fresh();
 let socket = null;
@@ -224,6 +227,7 @@ function showPanels() {
   $("speed-card").hidden = !first("GroundSpeed");
   $("gyro-card").hidden = $("accel-card").hidden = !first("Imu");
   $("radar-card").hidden = !first("RadarFrame");
+  $("obstacles-card").hidden = !first("Obstacles");
   $("target-card").hidden = !first("DopplerTarget");
   for (const series of all("DopplerTarget")) {
     if (targetCharts.has(series.name)) continue;
@@ -288,6 +292,7 @@ function drawing() {
   };
   show(charts.speed, ground, speedInWords);
   if (first("RadarFrame")) turns.push(showPicture);
+  if (first("Obstacles")) turns.push(showObstacles);
   show(charts.gyro, imu, imuInWords);
   show(charts.accel, imu, () => {});
   for (const [name, target] of targetCharts) {
@@ -386,6 +391,17 @@ function targetInWords(name, { words, holder }, target) {
   if (words.textContent === said) return;
   words.textContent = said;
   holder.setAttribute("aria-label", `Doppler target ${said}`);
+}
+
+function showObstacles() {
+  const found = sampleAt(first("Obstacles"));
+  if (!found) return;
+  const cues = first("Cue");
+  const cue = cues ? sampleAt(cues) : null;
+  obstacles.show(obstacleRows(found));
+  obstaclePicture.draw(found, cue);
+  const said = obstaclesInWords(found, cue);
+  if ($("obstacles-words").textContent !== said) $("obstacles-words").textContent = said;
 }
 
 function showPicture() {
