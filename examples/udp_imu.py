@@ -68,7 +68,8 @@ class UdpImu(Source):
                 try:
                     datagram = receiver.recv(LONGEST)
                 except TimeoutError:
-                    yield Quiet()
+                    last = max(time.time_ns(), last + 1)
+                    yield Quiet(until=last)
                     continue
                 last = max(time.time_ns(), last + 1)  # strictly increasing, also where the clock is set back
                 if (imu := sample(datagram, last)) is not None:
