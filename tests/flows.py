@@ -1,5 +1,6 @@
 """A cane that is spread over machines, a recording for it, and launchers to run it with: for several test files."""
 
+import itertools
 import os
 import re
 import signal
@@ -9,7 +10,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -135,15 +136,23 @@ def launchers() -> Iterator[Callable[..., Launched]]:
                 each.kill()
 
 
+# Each worker of pytest has a thousand ports of its own; runs beside one another begin at different ones.
+_ports = itertools.cycle(
+    10_000 + 1000 * int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 20_000 + (os.getpid() + each) % 1000
+    for each in range(1000)
+)
+
+
 def free_port(address: str = "127.0.0.1") -> int:
-    """A port that nobody listens on just now."""
-    with socket.socket() as probe:
-        probe.bind((address, 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """A port that nobody listens on, and that no other test or system hands out meanwhile: below the ephemeral ones."""
+    while True:
+        port = next(_ports)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind((address, port))
+            return port
 
 
-def wait_for(condition: Callable[[], object], what: str, deadline: float = 30.0) -> None:
+def wait_for(condition: Callable[[], object], what: str, deadline: float = 60.0) -> None:
     end = time.monotonic() + deadline
     while not condition():
         assert time.monotonic() < end, f"waited {deadline} s for {what}"

@@ -195,7 +195,7 @@ def test_the_final_error_is_of_the_size_that_the_covariance_says() -> None:
     The long test in test_cane_filter_walks.py does it on simulated radar, which is less kind.
     """
     squares = []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         waves, phases = rng.normal(0.0, 1 / 1.8, (4, 2)), rng.uniform(0.0, 2 * math.pi, 4)
         north = 14 * DEGREE * math.sqrt(0.5) * np.sin(loop().truth @ waves.T + phases).sum(axis=1)
@@ -205,7 +205,7 @@ def test_the_final_error_is_of_the_size_that_the_covariance_says() -> None:
         assert covariance is not None
         error = np.array(estimates[-1].position[:2]) - walk.truth[-1]
         squares.append(float(error @ np.linalg.solve(covariance[:2, :2], error)))
-    assert 0.3 < np.mean(squares) < 3.5  # chi-square of 12 degrees of freedom over 6: 0.73 to 3.9, 19 times in 20
+    assert 0.3 < np.mean(squares) < 3.5  # chi-square of 8 degrees of freedom over 4: 0.54 to 4.4, 19 times in 20
     assert max(squares) < 9.2
 
 

@@ -105,7 +105,7 @@ def radar() -> Iterator[int]:
         server.start()
         yield udp.getsockname()[1]
         ends.set()
-        server.join(timeout=5.0)
+        server.join(timeout=60.0)
 
 
 def test_a_radar_that_answers(look: Look, radar: int) -> None:

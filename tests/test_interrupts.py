@@ -95,7 +95,7 @@ def test_ctrl_c_while_the_command_is_imported_says_nothing(tmp_path: Path) -> No
         assert program.stdout is not None
         assert program.stdout.readline() == "importing\n"
         program.send_signal(signal.SIGINT)
-        assert program.communicate(timeout=30) == ("", "")
+        assert program.communicate(timeout=60) == ("", "")
     assert program.returncode == 130
 
 
@@ -132,7 +132,7 @@ def test_a_signal_during_the_work_leaves_nothing_behind(
         assert len(list(tmp_path.iterdir())) == 2, "the output lies beside, under a name of its own"
         for number in signals:
             program.send_signal(number)
-        assert program.communicate(timeout=30) == ("", "")
+        assert program.communicate(timeout=60) == ("", "")
     assert program.returncode == status
     assert list(tmp_path.iterdir()) == [table]
 
@@ -149,7 +149,7 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(tmp_path: Path) -> 
             program.send_signal(signal.SIGHUP)
             program.send_signal(signal.SIGINT)
             rows.write("1,1,2,3\n")
-        assert program.wait(timeout=30) == 0
+        assert program.wait(timeout=60) == 0
     with Recording(tmp_path / "out.mcap") as recording:
         assert recording.streams["imu", "imu"].count == 2
 
@@ -194,6 +194,6 @@ def test_workers_end_with_the_command_and_say_nothing(
         while len(workers := [int(each.name) for each in pids.iterdir()]) < 2:
             assert program.poll() is None
         (os.killpg if whole_group else os.kill)(program.pid, number)
-        assert program.communicate(timeout=30) == ("", "")
+        assert program.communicate(timeout=60) == ("", "")
     assert program.returncode == (130 if number == signal.SIGINT else -number)
     assert not [pid for pid in workers if psutil.pid_exists(pid)]

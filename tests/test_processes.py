@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 import zenoh
@@ -231,13 +232,18 @@ def test_a_replay_keeps_the_recorded_spacing(cane: Path, walk: Path, tmp_path: P
     done = caneflow("run", cane, "--replay", walk, "--speed", "2", "--start", "1", "--duration", "2", "--record", out)
     assert done.returncode == 0, done.stderr
     with Recording(out) as recording:
-        times = {key: [s.log_time for s in recording.samples([key])] for key in (("imu", "imu"), ("fusion", "pose"))}
+        times = {
+            key: np.array([(sample.stamp, sample.log_time) for sample in recording.samples([key])]) * 1e-9
+            for key in (("imu", "imu"), ("fusion", "pose"))
+        }
         first = next(recording.samples([("imu", "imu")]))
     assert first.stamp == 2_000_000_000
     assert first.seq == 0  # a run counts anew
-    for stream, log_times in times.items():
-        assert len(log_times) == 200, stream
-        assert (log_times[-1] - log_times[0]) / 1e9 == pytest.approx(1.99 / 2, abs=0.3)
+    for stream, of_stream in times.items():
+        assert len(of_stream) == 200, stream
+        # A busy machine holds some samples up, never all of them: those that came soonest tell the pace.
+        soonest = (of_stream[:, 1] - of_stream[:, 0] / 2).reshape(2, 100).min(axis=1)
+        assert soonest[1] - soonest[0] == pytest.approx(0.0, abs=0.3), "s; 0.5 at half or at full speed"
 
 
 def test_a_loop_goes_on_with_stamps_and_numbers(
@@ -347,7 +353,7 @@ def test_a_killed_launcher_leaves_no_process(live: Path, start: Callable[..., Ru
     wait_for(lambda: len(running.nodes()) == 2, "two nodes")
     running.process.kill()
     running.process.wait()
-    wait_for(lambda: not running.nodes(), "the end of all nodes", deadline=5.0)
+    wait_for(lambda: not running.nodes(), "the end of all nodes")
 
 
 @BOTH_LINKS
@@ -536,7 +542,7 @@ def test_hostile_samples_are_refused_counted_and_named_once(live: Path, start: C
     key = sample_key(running.flow, "ticker", "imu")
     with running.session() as session:
         next(counters(session, running.flow, "echo"))
-        for payload in (good[:-3], good + b"x", b"", b"\xc1", os.urandom(200), good, good):
+        for payload in (good[:-3], good + b"x", b"", b"\xc1", np.random.default_rng(1).bytes(200), good, good):
             session.put(key, payload)
         session.put(key, good, encoding=zenoh.Encoding("application/msgpack").with_schema("caneflow.Pose/1"))
         for counted in counters(session, running.flow, "echo"):
@@ -657,7 +663,6 @@ def test_verify_names_the_first_difference(cane: Path, walk: Path, tmp_path: Pat
     out = tmp_path / "out.mcap"
     done = caneflow("run", cane, "--replay", walk, "--in-process", "--record", out)
     assert done.returncode == 0, done.stderr
-    assert caneflow("verify", cane, out).returncode == 0
     other = ["--set", "fusion.luenberger.pole_acceleration=0.500001"]
     done = caneflow("verify", cane, out, *other)
     assert done.returncode == 1

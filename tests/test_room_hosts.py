@@ -26,7 +26,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def poses(walk: Path, out: Path, method: str, *options: str) -> list[bytes]:
     command = [sys.executable, "-m", "caneflow.command", "run", str(ROOT / "dataflows" / "room.yaml")]
-    chosen = ["--replay", str(walk), "--record", str(out), "--set", f"room_tracker.method={method}", *options]
+    part = ["--replay", str(walk), "--duration", "6"]
+    chosen = [*part, "--record", str(out), "--set", f"room_tracker.method={method}", *options]
     done = subprocess.run([*command, *chosen], capture_output=True, text=True, timeout=100, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     with Recording(out) as got:

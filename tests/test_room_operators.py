@@ -455,7 +455,7 @@ def test_a_reference_room_is_calibrated_and_tracked(
     assert status == 0
     assert "south" in said
     flow = ROOT / "dataflows" / "room.yaml"
-    replay = ("--replay", paths[""], "--duration", 40, "--in-process")
+    replay = ("--replay", paths[""], "--duration", 25, "--in-process")
     assert caneflow("run", flow, *replay, "--rig", rig, "--record", out)[0] == 0
     assert mean_error(paths[""], out) < limit
 

@@ -336,7 +336,7 @@ SAMPLE = numbered(Imu(stamp=1, gyro=(0.0, 0.0, 0.0)), 0)
 
 def say_until(condition: Callable[[], object], *puts: Callable[[], None]) -> None:
     """Publish again and again, since a fresh subscription takes a moment, until `condition`."""
-    end = time.monotonic() + 30
+    end = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < end, "nothing came, not even what is allowed"
         for put in puts:
@@ -404,7 +404,7 @@ def test_a_machine_does_not_speak_for_another_ones_nodes(target: Target) -> None
         look()
         del own, false  # an undeclared token is one that no variable holds
         assert seen == {control_key(flow, "ready", "fusion")}
-        list(phone.get(control_key(flow, "status"), timeout=5.0))  # a round trip: the ends of the tokens have come
+        list(phone.get(control_key(flow, "status"), timeout=60.0))  # a round trip: the ends of the tokens have come
         assert "zenoh" not in target.launched.said, "what Zenoh says of a token that it does not know is no news"
 
 
@@ -437,7 +437,7 @@ def test_past_samples_are_sent_for_wired_ports_only(target: Target) -> None:
             return sum(reply.ok is not None for reply in replies)
 
         wait_for(lambda: all(answers(phone, key) for key in wired), "what the phone's nodes may ask")
-        assert [answers(inside, key) for key in unwired[:2]] == [1, 1], "they are there"
+        wait_for(lambda: [answers(inside, key) for key in unwired[:2]] == [1, 1], "what is there")
         asked.clear()
         assert [answers(phone, key) for key in unwired] == [0] * 4
         assert [answers(laptop, key) for key in (*wired, *unwired)] == [0] * 6
@@ -477,7 +477,7 @@ def test_an_observer_reads_everything_and_writes_nothing(target: Target) -> None
             lambda: inside.put(frame, SAMPLE),
             lambda: phone.put(own, SAMPLE),
         )
-        status = [reply.ok for reply in laptop.get(control_key(flow, "status"), timeout=5.0) if reply.ok]
+        status = [reply.ok for reply in laptop.get(control_key(flow, "status"), timeout=60.0) if reply.ok]
 
         assert set(read.keys) == {frame, own}
         assert set(written.keys) == {own}

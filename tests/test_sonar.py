@@ -134,7 +134,7 @@ def test_the_driver_reads_an_emulated_chip_over_its_socket(tmp_path: Path) -> No
         brought: Any = next(samples)
         port, reading = brought
         samples.close()
-        thread.join(timeout=10)
+        thread.join(timeout=60)
     assert port == "ranges"
     assert isinstance(reading, Ranges)
     assert reading.ranges[0] == pytest.approx(1.23)
@@ -161,5 +161,5 @@ def test_a_bus_that_refuses_says_why_over_the_socket() -> None:
         assert i2c_socket.ANSWER.unpack(mine.recv(3)) == (errno.EREMOTEIO, 0)
         assert os.strerror(errno.EREMOTEIO)
         mine.shutdown(socket.SHUT_WR)
-        thread.join(timeout=10)
+        thread.join(timeout=60)
     assert not thread.is_alive()

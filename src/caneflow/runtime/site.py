@@ -4,11 +4,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from caneflow.runtime.dataflow.graph import Graph, Node
-from caneflow.runtime.dataflow.yaml_shape import ENDPOINT_PATTERN
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.wording import did_you_mean, listed
+
+if TYPE_CHECKING:  # `status` wants to know where keys lie, and half a second goes by until a graph is imported
+    from caneflow.runtime.dataflow.graph import Graph, Node
 
 DEFAULT_KEYS = Path("keys")  # the folder with an observer's certificate
 
@@ -33,7 +35,7 @@ class Site:
         return self.name == self.leader
 
 
-def site_of(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | None:
+def site_of(graph: "Graph", machine: str, nodes: "Mapping[str, Node]") -> Site | None:
     """The place of `machine` in the graph; None when it is the only one."""
     if machine not in graph.machines:
         raise DataflowError(
@@ -62,7 +64,7 @@ def site_of(graph: Graph, machine: str, nodes: Mapping[str, Node]) -> Site | Non
     )
 
 
-def door_of(graph: Graph, listen: str | None) -> Site | None:
+def door_of(graph: "Graph", listen: str | None) -> Site | None:
     """Where the only machine of the graph, and `listen`, let other programs in, and its router; None: nowhere."""
     used = list({node.machine: None for node in graph.nodes.values()})
     if len(used) != 1:
@@ -86,6 +88,8 @@ def with_endpoint(site: Site, listen: str | None) -> Site:
     """The same, listening at `listen` as well; raises DataflowError when that is no endpoint."""
     if listen is None:
         return site
+    from caneflow.runtime.dataflow.yaml_shape import ENDPOINT_PATTERN
+
     if not re.fullmatch(ENDPOINT_PATTERN, listen):
         raise DataflowError(f"--listen {listen}: is no endpoint; write tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447")
     return replace(site, listen=tuple(dict.fromkeys([*site.listen, listen])))
