@@ -170,7 +170,8 @@ def test_a_group_in_a_replay_that_is_asked_to_restart_computes_the_same_bytes(tm
     with launchers() as launch:
         launched = launch("run", flow, "--replay", walk, "--in-process", "--record", alone, log=tmp_path / "log")
         assert launched.ends() == 0, launched.said
-        launched = launch("run", flow, "--replay", walk, "--record", out, log=tmp_path / "log")
+        slowly = ("--speed", 0.4)  # the command must be through before the replay is
+        launched = launch("run", flow, "--replay", walk, *slowly, "--record", out, log=tmp_path / "log")
         launched.wait_for("ready: 5 nodes")
         before = node_processes(launched.process.pid)
         again = restarted(launchers_of("asked"), "fusion")

@@ -5,8 +5,9 @@ line under its arrivals. So the tracks are compared at the same times after the 
 emulators are told, counted from where both have begun, and may be apart by what speed times such a delay, and a heading
 that is a sample late, make on the way. On a busy machine some values of the chip are not read at all (the bytes of a
 pseudo-terminal wait for a kernel thread), so the replay is of the values that were read, with the recording's stamps;
-where they were nearly all, also of the recording as it is. What the flow itself makes of its inputs has no such
-freedom: the live run's own recording gives the same track, byte for byte.
+where they were nearly all, also of the recording as it is. A busy machine reads later than some ms, which the stamps
+show: a heading that is so much late errs by so much of a turn, all along the way. What the flow itself makes of its
+inputs has no such freedom: the live run's own recording gives the same track, byte for byte.
 """
 
 import re
@@ -35,6 +36,7 @@ DEADLINE = 60.0  # s for anything that is waited for, beside the walk
 LEAD = 3.0  # s that a chip takes to start, and a radar to be set up, before the recording begins ...
 STARTS = 3.0  # ... and how many times as long as a command takes to say its help
 APART, APART_OF_WAY = 0.08, 0.005  # m, and of the way walked: how far the tracks of the same values may be apart
+READ_LATE, TURNING = 0.02, 2.0  # s, at most as a rule; rad/s, of a swinging cane
 NEARLY_ALL, MISSING_APART_OF_WAY = 0.97, 0.02  # of the values read; with the others missing, of the way walked
 
 
@@ -133,6 +135,13 @@ def heard_part(walk: Path, live: Path, out: Path) -> dict[type[Sample], float]:
     return {kind: count / (len(recorded) / 2) for kind, count in counts.items()}
 
 
+def read_late(walk: Path, live: Path) -> float:
+    """How much later than the soonest one in twenty values was read, s."""
+    stamps = {key: sample.stamp for key, sample in said(walk)}
+    delays = [sample.stamp - stamps[key] for key, sample in said(live) if isinstance(sample, Imu)]
+    return float(np.quantile(delays, 0.95) - min(delays)) * 1e-9
+
+
 def apart(live: Track, replayed: Track) -> tuple[float, float]:
     """The largest distance between the tracks from where both have begun, and the way walked; m."""
     t0, t1 = max(live.times[0], replayed.times[0]), min(live.times[-1], replayed.times[-1])
@@ -224,7 +233,7 @@ def _cpu_times(launcher: int) -> dict[str, float]:
 
 
 @pytest.mark.timeout(400)  # a busy machine is no failure
-@pytest.mark.parametrize("seconds", [12, pytest.param(60, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seconds", [9, pytest.param(60, marks=pytest.mark.long)])
 def test_live_gives_the_track_of_the_replay(
     seconds: int, desk: Callable[[int], Desk], tmp_path: Path, start: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
@@ -238,11 +247,12 @@ def test_live_gives_the_track_of_the_replay(
     run_to_its_end("run", given.flow, *given.rig, "--replay", heard, *replay)
     distance, walked = apart(track(out, lived.begin), track(replayed, given.begin))
     assert walked > 0.3 * seconds
-    assert distance < APART + APART_OF_WAY * walked
+    late = max(read_late(given.walk, out) - READ_LATE, 0.0) * TURNING
+    assert distance < APART + (APART_OF_WAY + late) * walked, f"{late} rad late"
     if min(of_imu, of_radar) > NEARLY_ALL:
         run_to_its_end("run", given.flow, *given.rig, "--replay", given.walk, *replay)
         distance, walked = apart(track(out, lived.begin), track(replayed, given.begin))
-        assert distance < APART + MISSING_APART_OF_WAY * walked
+        assert distance < APART + (MISSING_APART_OF_WAY + late) * walked, f"{late} rad late"
     assert "samples equal in every byte" in run_to_its_end("verify", given.flow, out)
 
 
