@@ -40,15 +40,21 @@ def add(
         int, typer.Option(metavar="N", min=1, max=3650, help="days that it holds")
     ] = certificates.MACHINE_DAYS,
     anew: Annotated[bool, typer.Option("--anew", help="in the place of one that is there")] = False,
+    addresses: Annotated[
+        list[str] | None,
+        typer.Option("--address", metavar="ADDR", help="IP address or host name that browsers use; repeatable"),
+    ] = None,
 ) -> None:
-    """Make the key and certificate of one machine.
+    """Make the key and certificate of one machine, or of a page for phones: add page --address 192.168.1.5.
 
     Copy NAME.key, NAME.crt and ca.crt into a folder `keys` beside the dataflow file on that machine, and nothing else.
 
     Example: caneflow keys add gateway
     """
     _need_library()
-    certificate = certificates.make_certificate(folder, name, observer=observer, days=days, anew=anew)
+    certificate = certificates.make_certificate(
+        folder, name, observer=observer, days=days, anew=anew, addresses=addresses or ()
+    )
     own = f"{certificate.with_suffix('.key').name}, {certificate.name} and {certificates.AUTHORITY}.crt"
     print(f"{certificate}: made; {name} needs {own}")
 

@@ -5,10 +5,11 @@ machine needs `ca.crt` and its own two; `ca.key` makes new certificates and stay
 """
 
 import datetime
+import ipaddress
 import os
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -74,11 +75,17 @@ def make_authority(folder: Path) -> Path:
 
 
 def make_certificate(
-    folder: Path, name: str, *, observer: bool = False, days: int = MACHINE_DAYS, anew: bool = False
+    folder: Path,
+    name: str,
+    *,
+    observer: bool = False,
+    days: int = MACHINE_DAYS,
+    anew: bool = False,
+    addresses: Sequence[str] = (),
 ) -> Path:
     """Make the certificate of a machine, or of an observer; raises DataflowError when it cannot be.
 
-    `anew`: in the place of one that is there.
+    `anew`: in the place of one that is there. `addresses`: IP addresses and host names by which browsers come to it.
     """
     if not re.fullmatch(NAME.pattern, name):
         raise DataflowError(f"{name!r} is no name; that is {NAME_RULE}")
@@ -90,7 +97,7 @@ def make_certificate(
     authority, authority_key = _authority(folder)
     key = _new_key()
     subject = _name(OBSERVER, unit=name) if observer else _name(name)
-    _store(folder, name, _signed(subject, key, authority.subject, authority_key, days), key)
+    _store(folder, name, _signed(subject, key, authority.subject, authority_key, days, addresses=addresses), key)
     return certificate
 
 
@@ -148,6 +155,7 @@ def _signed(
     days: int,
     *,
     authority: bool = False,
+    addresses: Sequence[str] = (),
 ) -> "x509.Certificate":
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes
@@ -169,11 +177,24 @@ def _signed(
         # changes. TLS wants an alternative name all the same.
         common = str(subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
         builder = builder.add_extension(
-            x509.SubjectAlternativeName([x509.DNSName(common.replace("_", "-"))]), critical=False
+            x509.SubjectAlternativeName([x509.DNSName(common.replace("_", "-")), *map(_alternative, addresses)]),
+            critical=False,
         ).add_extension(
             x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]), critical=False
         )
     return builder.sign(issuer_key, hashes.SHA256())
+
+
+def _alternative(address: str) -> "x509.GeneralName":
+    from cryptography import x509
+
+    try:
+        return x509.IPAddress(ipaddress.ip_address(address))
+    except ValueError:
+        pass
+    if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?", address):
+        raise DataflowError(f"{address!r}: not an address; expected e.g. 192.168.1.5 or gateway.local")
+    return x509.DNSName(address)
 
 
 def _store(folder: Path, name: str, certificate: "x509.Certificate", key: "ec.EllipticCurvePrivateKey") -> None:
