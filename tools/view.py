@@ -18,10 +18,10 @@ import typer
 from annotated_types import Ge, Le
 
 from caneflow.errors import CaneflowError, not_installed
-from caneflow.messages import MessageError, Sample, decode
+from caneflow.messages import Cue, MessageError, Sample, decode
 from caneflow.messages.control import FlowStatus
 from caneflow.messages.registry import SCHEMA
-from caneflow.messages.rig import Rig, read_rig
+from caneflow.messages.rig import Rig, User, read_rig
 from caneflow.options import At, Keys
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.hosts.attached.flow_events import Began, Came, Ended, Told
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+LOOPBACK = "127.0.0.1"
 LAST_WORDS = 0.15  # s that a page is given to hear of the end
 
 
@@ -46,6 +47,12 @@ def command(
     keys: Keys = DEFAULT_KEYS,
     port: Annotated[int, typer.Option(min=0, max=65535, help="On 127.0.0.1; 0: any that is free.")] = 0,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the page in the browser of this machine.")] = False,
+    phone: Annotated[
+        bool, typer.Option("--phone", help="Serve the phone's page instead: cues as sound, vibration and words.")
+    ] = False,
+    listen: Annotated[
+        str, typer.Option(metavar="ADDR", help="Of --phone: address of this machine; beyond loopback keys/page.crt.")
+    ] = LOOPBACK,
 ) -> None:
     """Show a running flow in the browser: track, speed, range-Doppler map, IMU, nodes and edges; or a recording.
 
@@ -56,10 +63,33 @@ def command(
     Example: caneflow view cane --open
     """
     with contextlib.suppress(KeyboardInterrupt):
-        if what is not None and (Path(what).is_file() or Path(what).suffix == ".mcap"):
+        if phone:
+            _serve_phone(what, at, keys, listen, port)
+        elif what is not None and (Path(what).is_file() or Path(what).suffix == ".mcap"):
             _show_recording(Path(what), port, open_browser=open_browser)
         else:
             _show_flow(what, at, keys, port, open_browser=open_browser)
+
+
+def _serve_phone(flow: str | None, at: str | None, keys: Path, listen: str, port: int) -> None:
+    """Tell a phone the cues of a running flow, until it ends."""
+    try:
+        from caneflow.viewing.phone_server import PhoneServer, certificate_in, in_squares
+    except ModuleNotFoundError as error:
+        raise CaneflowError(not_installed(str(error.name), "phone")) from error
+    from caneflow.runtime.hosts.attached.followed import followed  # here, as it takes Zenoh: a recording does not
+
+    with contextlib.closing(followed(flow, at, keys)) as events:
+        began = next(events)
+        assert isinstance(began, Began)
+        guidance = (read_rig(began.status.rig).user or User()).guidance
+        tls = certificate_in(keys)
+        with PhoneServer(guidance, hears=True, senses=False, listen=listen, port=port, tls=tls) as server:
+            print(f"{in_squares(server.address)}{server.address}  (Ctrl-C ends it)", flush=True)
+            for event in events:  # a flow that has ended is told as blind: no cue comes
+                if isinstance(event, Came) and event.kind is Cue:
+                    with contextlib.suppress(MessageError):
+                        server.tell(decode(event.payload, Cue))
 
 
 def _show_recording(path: Path, port: int, *, open_browser: bool) -> None:

@@ -24,7 +24,7 @@ from caneflow.runtime.user_files import OURS, kind_at, module_of, place_of
 from caneflow.runtime.wording import did_you_mean, dotted, listed, one_line, shown
 
 ROOMS = ("drivers", "operators")
-TOOLS = ("tools.view", "tools.ros2", "tools.foxglove")  # that are programs of a graph as well
+TOOLS = ("tools.view", "tools.ros2", "tools.foxglove", "tools.phone")  # that are programs of a graph as well
 IN_A_ROOM = re.compile(rf"({'|'.join(ROOMS)})\.[A-Za-z_][A-Za-z0-9_]*")
 NOT_THEIRS = ("<frozen", str(Path(messages.__file__).parent))  # in what users' code calls
 FILES_NAMED = 8  # of a folder without the file that was asked for
