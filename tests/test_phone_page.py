@@ -192,7 +192,8 @@ def moved(page: Page, seconds: float, rate: float) -> tuple[list[Imu], list[floa
         page.evaluate("clearInterval(window.moving)")
         given: list[float] = page.evaluate("window.sentAt")
         until(lambda: page.evaluate("caneflow.waiting.length") == 0)
-        until(lambda: samples.extend(taken(driver, server)) or len(samples) >= len(given))
+        while len(samples) < len(given):
+            samples += until(lambda: taken(driver, server))
     assert driver.refused == {}
     return samples, given
 

@@ -11,10 +11,9 @@ from typing import Annotated, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from caneflow.algorithms.rotations import Quaternion, Vector, multiply
-
 Milliseconds: TypeAlias = Annotated[float, Meta(ge=-1e14, le=1e14)]
 Three: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]  # w x y z
 
 
 class Reading(msgspec.Struct, frozen=True, kw_only=True):
@@ -40,9 +39,9 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
     """A reading in SI units, on this machine's clock."""
 
     stamp: int  # ns
-    gyro: Vector  # rad/s
-    accel: Vector | None  # m/s^2, specific force
-    linear_accel: Vector | None  # m/s^2
+    gyro: Three  # rad/s
+    accel: Three | None  # m/s^2, specific force
+    linear_accel: Three | None  # m/s^2
     orientation: Quaternion | None  # body to world, x east and z up where the browser knows the north
 
 
@@ -59,9 +58,12 @@ def motion_of(reading: Reading, offset: float) -> Motion:
 
 
 def orientation_of(alpha: float, beta: float, gamma: float) -> Quaternion:
-    """Body to world of the angles (deg) of a DeviceOrientation event."""
-    halves = [math.radians(angle) / 2 for angle in (alpha, beta, gamma)]
-    about_z: Quaternion = (math.cos(halves[0]), 0.0, 0.0, math.sin(halves[0]))
-    about_x: Quaternion = (math.cos(halves[1]), math.sin(halves[1]), 0.0, 0.0)
-    about_y: Quaternion = (math.cos(halves[2]), 0.0, math.sin(halves[2]), 0.0)
-    return multiply(multiply(about_z, about_x), about_y)
+    """Body to world of the angles (deg) of a DeviceOrientation event; W3C Device Orientation Event, worked example."""
+    z, x, y = (math.radians(angle) / 2 for angle in (alpha, beta, gamma))
+    cx, cy, cz, sx, sy, sz = math.cos(x), math.cos(y), math.cos(z), math.sin(x), math.sin(y), math.sin(z)
+    return (
+        cx * cy * cz - sx * sy * sz,
+        sx * cy * cz - cx * sy * sz,
+        cx * sy * cz + sx * cy * sz,
+        cx * cy * sz + sx * sy * cz,
+    )
