@@ -118,6 +118,7 @@ def geometry(rig: Rig) -> CaneGeometry:
         pivot=rig.need("pivot"),
         boresight=rig.boresight,
         antenna=rig.antenna,
+        aperture_across=rig.aperture_across,
     )
 
 

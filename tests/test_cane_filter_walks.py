@@ -202,7 +202,7 @@ def mounted(inputs: Inputs) -> CaneFilter:
 def test_velocity_on_a_walk_of_ours() -> None:
     """Speed of the antenna along the boresight, and what the estimate claims of itself."""
     inputs = simulated("hard", 7, 9.0)
-    found = [seen for seen in velocities(inputs, GroundVelocitySettings(every=1)) if seen is not None]
+    found = [seen for seen in velocities(inputs, GroundVelocitySettings(every=0.01)) if seen is not None]
     yaw = boresight_yaws(inputs.orientations, BORESIGHT)
     assert len(found) == len(yaw)
     velocity = np.gradient(inputs.positions, 0.01, axis=0)

@@ -79,7 +79,7 @@ def run(
     """
     speckle = np.random.default_rng(7).normal(size=(2, BINS)) / math.sqrt(2.0)
     background = standing((stands * (speckle[0] + 1j * speckle[1])).astype(np.complex64))
-    estimator = GroundVelocityEstimator(settings or GroundVelocitySettings(every=1), GEOMETRY)
+    estimator = GroundVelocityEstimator(settings or GroundVelocitySettings(every=0.01), GEOMETRY)
     attitudes = AttitudeHistory()
     estimates = []
     for index, scan in enumerate(scans):
@@ -175,7 +175,7 @@ def test_learns_that_the_hand_is_lower_than_the_rig_says() -> None:
 
 
 def test_without_an_attitude_there_is_nothing() -> None:
-    estimator = GroundVelocityEstimator(GroundVelocitySettings(every=1), GEOMETRY)
+    estimator = GroundVelocityEstimator(GroundVelocitySettings(every=0.01), GEOMETRY)
     scans = ground(0.45, scans=8)
     estimates = [
         estimator.update(returns_of(scan, i, standing(scan)), AttitudeHistory()) for i, scan in enumerate(scans)
@@ -187,7 +187,7 @@ def test_without_an_attitude_there_is_nothing() -> None:
 def test_an_estimate_every_few_frames_is_the_one_of_every_frame(every: int) -> None:
     scans = ground(0.45, scans=30, noise=0.2)
     _, each = run(scans)
-    estimator = GroundVelocityEstimator(GroundVelocitySettings(every=every), GEOMETRY)
+    estimator = GroundVelocityEstimator(GroundVelocitySettings(every=0.01 * every), GEOMETRY)
     attitudes = AttitudeHistory()
     for index, scan in enumerate(scans):
         attitudes.add(START_NS + index * PERIOD_NS, HELD, (0.0, 0.0, 0.0))

@@ -20,6 +20,7 @@ class CaneGeometry:
     pivot: Vector  # m, from the sensors to the hand, body frame
     boresight: Vector = (0.0, 1.0, 0.0)  # unit vector of the beam's axis, body frame
     antenna: Vector = (0.0, 0.0, 0.0)  # m, from the IMU to the antenna, body frame
+    aperture_across: float | None = None  # rad, full -3 dB angle across the cane; None: as `aperture`
 
 
 def antenna_height(geometry: CaneGeometry, orientation: Quaternion) -> float:

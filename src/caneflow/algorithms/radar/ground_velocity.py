@@ -33,6 +33,7 @@ from caneflow.algorithms.quantities import (
     Zero,
 )
 from caneflow.algorithms.radar.footprint import CaneGeometry, antenna_height, pitch
+from caneflow.algorithms.radar.matched_velocity import Doubts, lag_sums, matched_speed
 from caneflow.algorithms.radar.moving_returns import MovingReturns
 from caneflow.algorithms.radar.pulse_pairs import PulsePairWindow
 from caneflow.algorithms.radar.rest import ground_stands
@@ -46,6 +47,9 @@ UNOBSERVED: Final = 1e6  # (m/s)^2, variance of a component that is not observed
 _LOWEST_SPEED, _SPEED_STEP, _SPEEDS = -2.0, 0.4, 16  # m/s to begin with; so near that the nearest is the best
 _MOST_COHERENT: Final = 0.96  # squared coherence above which noise is not what limits a cell
 _FAINT: Final = 1e-30  # power of nothing
+LOOKED_PAIRS: Final = 5  # of scans, for which `looks` are stated
+ONE_BIN: Final = 1e-9  # m, less than any bin
+MANY_PAIRS: Final = 25  # in a window, from which on scans are weighed together and not cell by cell
 _HEAVES: Final = 64  # IMU samples that a window's middle may lie back
 
 
@@ -53,14 +57,14 @@ _HEAVES: Final = 64  # IMU samples that a window's middle may lie back
 class GroundVelocitySettings:
     """What the pulse pair may be told."""
 
-    window: Annotated[int, Ge(2), Le(1000)] = 5  # pairs of scans in a sum
-    every: Annotated[int, Ge(1), Le(1000)] = 5  # frames from one estimate to the next: windows that overlap err alike
+    window: Annotated[float, Ge(1e-3), Le(2)] = 0.05  # s of pairs of scans in a sum
+    every: Annotated[float, Ge(0), Le(2)] = 0.05  # s from one estimate to the next: windows that overlap err alike
     cell: Length = 0.075  # m of range in a sum: the pulse is 0.09 m long
     shallowest: Elevation = math.radians(16)  # rad, grazing angle
     steepest: Elevation = math.radians(75)  # rad
     beam_share: Factor = 0.7  # of the aperture, to either side of the boresight, that is looked at
     fewest_cells: Annotated[int, Ge(3), Le(1000)] = 5
-    looks: Factor = 2.75  # independent ones per cell and window: its 40 samples share one speckle
+    looks: Factor = 2.75  # independent ones per cell and 5 pairs of scans: their 40 samples share one speckle
     outlier: Speed = 0.3  # rad of phase, from which on a cell loses its weight: walls, people
     least_fit: OpenFraction = 0.3  # coherence of all cells with the fit that counts as ground seen
     alias_share: Fraction = 0.9  # of the unambiguous radial speed up to which a fit counts
@@ -72,6 +76,9 @@ class GroundVelocitySettings:
     rest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm, below which standing ground is rest
     rest_speed: Speed = 0.03  # m/s, sd of the antenna's then: drift and tremor of a hand
     rest_standing: Factor = 0.05  # of a scan's noise, power of the ground that stands then
+    least_significance: Factor = 6.0  # of the sum of pairs over its noise, with many scans in a window
+    speckle: Fraction = 0.02  # of the speed, sd that no window helps against: which scatterers are lit the most
+    least_error: Speed = 0.01  # m/s, sd below which no velocity of many scans is claimed
     heave: HeaveSettings = field(default_factory=HeaveSettings)
 
     def __post_init__(self) -> None:
@@ -129,8 +136,9 @@ class GroundVelocityEstimator:
     def __init__(self, settings: GroundVelocitySettings, geometry: CaneGeometry) -> None:
         self._settings = settings
         self._geometry = geometry
-        self._window = PulsePairWindow(window=settings.window, cell=settings.cell)
-        self._frames = 0  # since the last estimate
+        self._pairs = 2  # of scans in a window
+        self._window = PulsePairWindow(window=self._pairs, cell=settings.cell)
+        self._last_ns: int | None = None  # when an estimate was due last
         self._heave = HeaveObserver(settings.heave)
         self._heaves: deque[tuple[int, float, float]] = deque(maxlen=_HEAVES)  # stamp, height, rate
         self._height_error = 0.0  # m, to be added to the rig's
@@ -163,23 +171,28 @@ class GroundVelocityEstimator:
         ground or ground that does not move as one, and near the limit of unambiguous Doppler.
         """
         settings = self._settings
+        if returns.restarted:
+            self._begin(returns)
         self._window.push(returns)
-        self._frames += 1
-        if self._frames < settings.every:
+        elapsed = self._due(returns)
+        if elapsed is None:
             return None
-        self._frames = 0
         interval = self._window.interval_ns()
         if interval is None:
-            return _nothing(0.5 * settings.window * returns.parameters.scan_period)
+            return _nothing(0.5 * self._pairs * returns.parameters.scan_period)
         oldest_ns, newest_ns = interval
         delay = (newest_ns - oldest_ns) * 0.5e-9
         middle_ns = (oldest_ns + newest_ns) // 2
-        orientation = attitudes.at(middle_ns)
+        orientation = attitudes.near(middle_ns)
         if orientation is None:
             return _nothing(delay)
         height, rise, rise_error = self._vertical(middle_ns, orientation)
-        per_speed = 4 * math.pi * returns.parameters.carrier * (2 * delay / settings.window) / SPEED_OF_LIGHT
+        per_speed = 4 * math.pi * returns.parameters.carrier * (2 * delay / self._pairs) / SPEED_OF_LIGHT
         axis = pitch(self._geometry, orientation)
+        if self._pairs >= MANY_PAIRS:
+            turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
+            still = turn_rate is not None and turn_rate < settings.rest_turn_rate
+            return self._matched(returns, (height, rise, rise_error), axis, per_speed, delay, still=still)
         cells = self._lit(height + self._height_error, axis, per_speed)
         if cells is None:
             return _nothing(delay)
@@ -194,12 +207,62 @@ class GroundVelocityEstimator:
             return _nothing(delay)
         if float(np.maximum.reduce(cells.per_forward)) * abs(fit.forward) > settings.alias_share * math.pi:
             return _nothing(delay)
-        self._learn_height(fit, 2 * delay / settings.window * len(returns.scans) * settings.every)
+        self._learn_height(fit, elapsed)
         return VelocityEstimate(
             velocity=(fit.forward, 0.0),
             covariance=(fit.forward_variance, 0.0, UNOBSERVED),
             delay=delay,
             valid=True,
+        )
+
+    def _begin(self, returns: MovingReturns) -> None:
+        """Make the window for scans of another period; all that was in it is forgotten anyway."""
+        pairs = max(round(self._settings.window / returns.parameters.scan_period), 2)
+        if pairs != self._pairs:
+            self._pairs = pairs
+            # weak scans are not added up before they are compared: phases of neighbouring bins need not be alike
+            cell = ONE_BIN if pairs >= MANY_PAIRS else self._settings.cell
+            self._window = PulsePairWindow(window=pairs, cell=cell)
+
+    def _due(self, returns: MovingReturns) -> float | None:
+        """Seconds since the last estimate was due, if one is now: to the nearest frame."""
+        now = returns.stamps_ns[-1]
+        frame = len(returns.scans) * returns.parameters.scan_period
+        if self._last_ns is None or self._last_ns > now:
+            self._last_ns = now - round(frame * 1e9)
+        elapsed = (now - self._last_ns) * 1e-9
+        if elapsed < self._settings.every - 0.5 * min(frame, self._settings.every):
+            return None
+        self._last_ns = now
+        return elapsed
+
+    def _matched(
+        self, returns: MovingReturns, vertical: Triple, axis: float, per_speed: float, delay: float, *, still: bool
+    ) -> VelocityEstimate:
+        """The estimate of a window of many scans: weak as they are, together they tell."""
+        settings, (height, rise, rise_error) = self._settings, vertical
+        between = self._lit_ranges(height, axis)
+        if between is None:
+            return _nothing(delay)
+        scans, ranges, first = self._window.scans(*between)
+        if not len(ranges):
+            return _nothing(delay)
+        along, across, per_height = self._slopes(ranges, height, axis, per_speed)
+        sums = lag_sums(scans)
+        doubts = Doubts(rise=rise_error, least=settings.least_error, speckle=settings.speckle)
+        found = matched_speed(sums, along, across, per_height, rise, doubts)
+        if found is None or found.significance < settings.least_significance:
+            standing = self._window.power(returns.standing.scan(), first, len(ranges))
+            rest = float(sums.power.mean())
+            share = returns.standing.noise_share
+            if still and ground_stands(standing, rest, share, settings.rest_standing):
+                return _rest(delay, settings.rest_speed)
+            return _nothing(delay)
+        if float(along.max()) * abs(found.forward) > settings.alias_share * math.pi:
+            return _nothing(delay)
+        variance = found.variance + (found.per_height * settings.height_error) ** 2
+        return VelocityEstimate(
+            velocity=(found.forward, 0.0), covariance=(variance, 0.0, UNOBSERVED), delay=delay, valid=True
         )
 
     def _vertical(self, stamp_ns: int, orientation: Quaternion) -> Triple:
@@ -211,34 +274,46 @@ class GroundVelocityEstimator:
 
     def _lit(self, height: float, axis: float, per_speed: float) -> _Cells | None:
         """The cells that the beam lights, with the derivatives of their phase; None when there are too few."""
-        settings, aperture = self._settings, self._geometry.aperture
-        half = settings.beam_share * aperture
-        low, high = max(axis - half, settings.shallowest), min(axis + half, settings.steepest)
-        if low >= high or height <= 0.0:
+        between = self._lit_ranges(height, axis)
+        if between is None:
             return None
-        sums = self._window.sums(height / math.sin(high), height / math.sin(low))
-        if len(sums.ranges) < settings.fewest_cells:
+        sums = self._window.sums(*between)
+        if len(sums.ranges) < self._settings.fewest_cells:
             return None
-        sine = height / sums.ranges
-        cosine = np.sqrt(1.0 - sine * sine)
-        along = beam_factor(cosine, axis, aperture)
-        along *= cosine
-        along *= per_speed
-        sine *= -per_speed
+        along, sine, per_height = self._slopes(sums.ranges, height, axis, per_speed)
         return _Cells(
             pairs=sums.pairs,
             power=sums.power,
             per_forward=along,
             per_vertical=sine,
-            per_height=along * (-height / (cosine * sums.ranges) ** 2),
+            per_height=per_height,
             first=sums.first,
         )
+
+    def _lit_ranges(self, height: float, axis: float) -> tuple[float, float] | None:
+        """From where to where (m) the beam lights the ground; None where it does not."""
+        settings = self._settings
+        half = settings.beam_share * self._geometry.aperture
+        low, high = max(axis - half, settings.shallowest), min(axis + half, settings.steepest)
+        if low >= high or height <= 0.0:
+            return None
+        return height / math.sin(high), height / math.sin(low)
+
+    def _slopes(self, ranges: Floats, height: float, axis: float, per_speed: float) -> tuple[Floats, Floats, Floats]:
+        """How a cell's phase from scan to scan depends on forward and vertical speed, and per speed on the height."""
+        sine = height / ranges
+        cosine = np.sqrt(1.0 - sine * sine)
+        along = beam_factor(cosine, axis, self._geometry.aperture_across or self._geometry.aperture)
+        along *= cosine
+        along *= per_speed
+        sine *= -per_speed
+        return along, sine, along * (-height / (cosine * ranges) ** 2)
 
     def _ground_stands(self, returns: MovingReturns, cells: _Cells) -> bool:
         """Whether the lit cells show ground that stands still."""
         settings = self._settings
         standing = self._window.power(returns.standing.scan(), cells.first, len(cells.power))
-        rest = float(np.add.reduce(cells.power)) / (len(cells.power) * settings.window)
+        rest = float(np.add.reduce(cells.power)) / (len(cells.power) * self._pairs)
         return ground_stands(standing, rest, returns.standing.noise_share, settings.rest_standing)
 
     def _fit(self, cells: _Cells, rise: float, rise_error: float) -> Fit:
@@ -253,7 +328,7 @@ class GroundVelocityEstimator:
         square = pairs.real**2 + pairs.imag**2
         np.minimum(square, _MOST_COHERENT, out=square)
         weight = square / (1.0 - square)
-        weight *= 2.0 * settings.looks
+        weight *= 2.0 * settings.looks * max(self._pairs / LOOKED_PAIRS, 1.0)
         # the pairs turned back by each of the speeds to begin with, one more step for every row
         turned = np.empty((_SPEEDS, len(pairs)), np.complex128)
         turned[0] = pairs * np.exp(cells.per_forward * (-1j * _LOWEST_SPEED))

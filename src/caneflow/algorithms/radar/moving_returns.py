@@ -8,6 +8,7 @@ repeats the one before for the third time (no receiver is without noise: it hang
 another make, e.g. has other ranges, while the frames before and after it do not.
 """
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple, TypeAlias
@@ -27,9 +28,14 @@ FEWEST_POWERS = 10  # scans
 MOST_HELD = 3  # wild scans, or frames of another make, in a row; what lasts longer is believed
 MOST_REPEATS = 2  # of one scan, bit by bit
 GONE_POWER = 2.5  # taking off the background leaves so many times the power of the scan: what it shows is gone
-GONE_SCANS = 3  # in a row; right after a rest the ground that lay still adds its own power once, so up to 2 times
+# s, or 3 scans, in a row; right after a rest the ground that lay still adds its own power once, so up to 2 times
+GONE_TIME = 0.03
+FEWEST_GONE = 3  # scans
 FIRST_POWER = 6.0  # by which factor the powers of the first two scans may differ
 FEWEST_FOR_OFFSET = 8  # bins; of fewer, the mean over them is the echoes'
+# of a scan, whose power varies little by itself; fewer may jump farther: of one, noise alone passes 6 times its median
+# in 2 % of the scans
+STEADY_BINS = 64
 FORGOTTEN = 1.0  # s without a frame, after which one of another make is believed at once
 # Of a scan: the longest of a P440 has 16 384; the filter of the pulse takes the square of their number.
 MOST_BINS = 20_000
@@ -51,7 +57,7 @@ class MovingReturnsSettings:
     """How the standing picture is removed and how gaps are met."""
 
     background_time: Time = 0.5  # s, time constant of the running mean (cane.md row 3)
-    longest_gap: Annotated[int, Ge(0), Le(1000)] = 5  # scans that may be missing in a row before all starts anew
+    longest_gap: Annotated[float, Ge(0), Le(2)] = 0.05  # s of scans that may be missing before all starts anew
     # of the median power of 0.5 s and of the scan before: more is a wild scan; a cane that sets off gives a factor of 2
     wild_power: Factor = 6.0
 
@@ -178,7 +184,11 @@ class MovingReturnsFilter:
             )
         self._to_analytic = to_analytic  # only now: it raises ValueError for a pulse that the bins cannot hold
         self._background = Background(self._settings.background_time)
-        self._known = _Known(max(round(POWER_TIME / parameters.scan_period), FEWEST_POWERS))
+        self._known = _Known(
+            max(round(POWER_TIME / parameters.scan_period), FEWEST_POWERS),
+            jump=math.sqrt(max(STEADY_BINS / bins, 1.0)),
+            gone_scans=max(round(GONE_TIME / parameters.scan_period), FEWEST_GONE),
+        )
         self._last_ns = None
         self._make = make
 
@@ -188,7 +198,7 @@ class MovingReturnsFilter:
             return round(period_ns), 0, True
         elapsed_ns = max(first_ns - self._last_ns, 0)  # a frame's first stamp is worked out and may err a little
         lost = max(round(elapsed_ns / period_ns) - 1, 0)
-        if lost > self._settings.longest_gap:
+        if lost > round(self._settings.longest_gap * 1e9 / period_ns):
             return elapsed_ns, 0, True
         return elapsed_ns, lost, False
 
@@ -223,8 +233,9 @@ class MovingReturnsFilter:
 class _Known:
     """What is known of the scans so far, to tell what cannot be one of them."""
 
-    def __init__(self, count: int) -> None:
-        """`count`: how many powers are remembered."""
+    def __init__(self, count: int, *, jump: float = 1.0, gone_scans: int = 3) -> None:
+        """`count`: how many powers are remembered; `jump`: how much more than usual they may differ."""
+        self._jump, self._gone_scans = jump, gone_scans
         self._powers: deque[float] = deque(maxlen=count)
         self._held = 0  # wild scans in a row
         self._first: float | None = None  # power of the first scan, background and all, until a second one agrees
@@ -251,7 +262,7 @@ class _Known:
         if self._begun and self._first is None:
             return False
         power, first = _power(scan), self._first
-        apart = first is not None and max(power, first) > FIRST_POWER * min(power, first)
+        apart = first is not None and max(power, first) > self._jump * FIRST_POWER * min(power, first)
         self._first = power if apart or not self._begun else None
         self._begun = True
         if apart:
@@ -261,7 +272,7 @@ class _Known:
     def is_gone(self, whole: float, left: float) -> bool:
         """Whether the background has added power to several scans: `whole` before it was taken off, `left` after."""
         self._added = self._added + 1 if left > GONE_POWER * whole else 0
-        if self._added < GONE_SCANS:
+        if self._added < self._gone_scans:
             return False
         self._added = 0
         self._powers.clear()
@@ -269,7 +280,7 @@ class _Known:
 
     def is_wild(self, power: float, factor: float) -> bool:
         """Whether a scan has so much more `power`, less the background, than the others; takes note of it if not."""
-        powers = self._powers
+        powers, factor = self._powers, self._jump * factor
         if len(powers) >= FEWEST_POWERS and power > factor * powers[-1] and self._held < MOST_HELD:
             middle = len(powers) // 2
             if power > factor * float(np.partition(powers, middle)[middle]):

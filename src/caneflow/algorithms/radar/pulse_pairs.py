@@ -90,6 +90,12 @@ class PulsePairWindow:
             first=first,
         )
 
+    def scans(self, nearest: float, farthest: float) -> tuple[NDArray[np.complex64], Floats, int]:
+        """The scans between two ranges (m), (W, K), the cells' ranges, the first one's number; for cells of one bin."""
+        assert self._bins == 1, "made so"
+        first, last = bisect_left(self._range_list, nearest), bisect_left(self._range_list, farthest)
+        return self._scans.view()[first:last].T, self._ranges[first:last], first
+
     def power(self, scan: NDArray[np.complex64], first: int, count: int) -> Floats:
         """Sums of |x|^2 of one `scan`, shape (M,), over the bins of `count` cells from the `first` on."""
         inside = scan[first * self._bins : (first + count) * self._bins]
