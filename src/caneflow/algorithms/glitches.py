@@ -66,12 +66,15 @@ class JumpGate(Generic[V]):
     def update(self, stamp_ns: int, value: V) -> V:
         """`value`, or the last good one in its place."""
         good, near, confirmed = self._good, False, False
-        follows = self._last_ns is not None and stamp_ns - self._last_ns <= self._longest_gap_ns
-        self._last_ns = stamp_ns
+        last_ns, self._last_ns = self._last_ns, stamp_ns
+        follows = last_ns is not None and stamp_ns - last_ns <= self._longest_gap_ns
         if good is not None:
             apart = self._distance(value, good)
             if follows:
                 near, confirmed = apart <= self._limit, self._confirmed
+                if near and confirmed and not self._held:  # nearly every sample; nothing else changes
+                    self._good = value
+                    return value
             if not near and (confirmed or apart > self._unseen_limit) and self._held < self._most_held:
                 self._confirmed, self.holding, self.contradicted = confirmed, True, False
                 self._held += 1

@@ -34,7 +34,7 @@ class InProcess:
         """`programs`: the class of each node of the graph, by name."""
         if not deployment.replay:
             raise DataflowError("--in-process runs on a recording; give --replay REC")
-        self._group = Group(deployment.plans, received=_at_its_stamp)
+        self._group = Group(deployment.plans, received=_at_its_stamp, spares_marks=True)
         self._sources: dict[str, Source] = {}
         for name in in_order(deployment.plans):
             plan = deployment.plans[name]
@@ -87,6 +87,11 @@ class InProcess:
         return heapq.merge(*each, key=_stamp)  # equal stamps: in the order of the nodes
 
     def _handle_what_is_due(self) -> None:
+        self._step()
+        self._group.tell_all_marks()  # what the samples alone do not tell: once, and not after each of them
+        self._step()
+
+    def _step(self) -> None:
         while self._group.step() is not None:
             pass
 
