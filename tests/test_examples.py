@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caneflow.command import main
-from caneflow.messages import GroundSpeed, Imu, MessageError, decode, encode, with_number
+from caneflow.messages import SAMPLES, GroundSpeed, Imu, MessageError, decode, encode, with_number
 from caneflow.recording import Recording
 from caneflow.testing import run_operator, run_source
 
@@ -21,6 +21,14 @@ sys.path.insert(0, str(EXAMPLES))
 from distance import FARTHEST, Distance  # noqa: E402 - examples are files of a user's own, in no package
 from distance_walked import DistanceWalked  # noqa: E402
 from udp_imu import UdpImu, sample  # noqa: E402
+
+del SAMPLES[Distance.schema]  # for all tests of caneflow's own messages, which this import comes before
+
+
+@pytest.fixture(autouse=True)
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example's message is one while its own tests run."""
+    monkeypatch.setitem(SAMPLES, Distance.schema, Distance)
 
 
 def speed(stamp: float, value: float, *, valid: bool = True) -> GroundSpeed:
