@@ -352,7 +352,7 @@ def test_whatever_is_read_the_estimate_is_a_rotation(
     attitude.update(stamp, STILL, UP)
     for elapsed, gyro, accel, mag in samples:
         stamp += elapsed
-        orientation, bias = attitude.update(stamp, gyro, accel, mag)
+        orientation, bias, _ = attitude.update(stamp, gyro, accel, mag)
         assert sum(x * x for x in orientation) == pytest.approx(1.0, abs=1e-9)
         assert all(abs(x) <= 2.0 * DEGREE + 1e-12 for x in bias)
 

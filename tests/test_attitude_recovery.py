@@ -7,9 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caneflow.algorithms.inertial.attitude_filter import AttitudeFilter, AttitudeFilterSettings
-from caneflow.algorithms.inertial.attitude_recovery import RECOVERY, Holes, Recovery, UndisturbedField
+from caneflow.algorithms.inertial.attitude_recovery import RECOVERY, Holes, Recovery, UndisturbedField, alike
 from caneflow.algorithms.inertial.initial_attitude import AttitudeMethod
 from caneflow.algorithms.inertial.madgwick import Madgwick, MadgwickSettings
+from caneflow.algorithms.inertial.mean_force import TiltError
 from caneflow.algorithms.rotations import (
     IDENTITY,
     Quaternion,
@@ -132,7 +133,7 @@ def test_the_spread_grows_with_the_hole_and_with_the_motion() -> None:
 @settings(max_examples=50, deadline=None)
 def test_where_nothing_was_known_field_and_force_tell_the_whole_rotation(turn: Vector) -> None:
     truth = from_rotation_vector(turn)
-    recovery = Recovery(math.inf, 0.5, UNDISTURBED)
+    recovery = Recovery(None, TiltError(0.5), UNDISTURBED)
     for _ in range(3):
         recovery.update(IDENTITY, rotate(conjugate(truth), UP), rotate(conjugate(truth), FIELD), 0.01)
     assert between(recovery.turn, truth) < 0.1 * DEGREE
@@ -142,7 +143,7 @@ def test_where_nothing_was_known_field_and_force_tell_the_whole_rotation(turn: V
 def test_a_force_alone_is_followed_by_its_weight() -> None:
     """A tilt of 0.1 rad seen for 1 s by a body whose speed changes by 1 m/s: sd 1 / 9.8 rad, as much as is unknown."""
     spread, tilt = 1.0 / GRAVITY, 0.1
-    recovery = Recovery(spread, 1.0, None)
+    recovery = Recovery(alike(spread), TiltError(1.0), None)
     seen = rotate(from_rotation_vector((-tilt, 0.0, 0.0)), UP)
     for _ in range(101):
         recovery.update(IDENTITY, seen, None, 0.01)
@@ -156,7 +157,7 @@ def test_a_force_alone_is_followed_by_its_weight() -> None:
 
 
 def test_a_field_of_another_strength_is_not_believed() -> None:
-    recovery = Recovery(0.5, 0.5, UNDISTURBED)
+    recovery = Recovery(alike(0.5), TiltError(0.5), UNDISTURBED)
     turned = rotate(from_rotation_vector((0.0, 0.0, 0.8)), FIELD)
     recovery.update(IDENTITY, UP, (1.3 * turned[0], 1.3 * turned[1], 1.3 * turned[2]), 0.01)
     assert not recovery.has_field
@@ -164,7 +165,7 @@ def test_a_field_of_another_strength_is_not_believed() -> None:
 
 
 def test_free_fall_and_no_readings_tell_nothing() -> None:
-    recovery = Recovery(math.inf, 0.5, None)
+    recovery = Recovery(None, TiltError(0.5), None)
     recovery.update(IDENTITY, None, None, 0.01)
     recovery.update(IDENTITY, STILL, None, 0.01)
     assert recovery.turn == IDENTITY

@@ -18,7 +18,15 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar, cast
 
-from caneflow.algorithms.inertial.attitude_recovery import FIELD_ERROR, SMALLEST, Holes, Recovery
+from caneflow.algorithms.inertial.attitude_recovery import (
+    FIELD_ERROR,
+    SMALLEST,
+    Covariance,
+    Holes,
+    Recovery,
+    alike,
+    largest_spread,
+)
 from caneflow.algorithms.inertial.gyro_bias import (
     NOTHING_SEEN,
     GyroBias,
@@ -33,7 +41,8 @@ from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleCloc
 from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, level, required_start
 from caneflow.algorithms.inertial.magnetic_heading import MagneticHeading, MagneticHeadingSettings
 from caneflow.algorithms.inertial.magnetometer_lag import MagnetometerLag
-from caneflow.algorithms.inertial.unseen_turn import UnseenTurn
+from caneflow.algorithms.inertial.mean_force import ForceWander
+from caneflow.algorithms.inertial.unseen_turn import UnseenTurn, turned_about
 from caneflow.algorithms.quantities import Time
 from caneflow.algorithms.rotations import (
     Quaternion,
@@ -76,6 +85,7 @@ class AttitudeFilter:
         self._recovery: Recovery | None = None  # since the last hole
         self._opened = 0.0  # s, by which the variance of yaw was opened for it
         self._unseen = UnseenTurn()
+        self._wander = ForceWander()
         self._bridged: _Bridged | None = None  # until the turn in the last hole is known better
 
     @property
@@ -110,9 +120,11 @@ class AttitudeFilter:
         if self._recovery is None:
             self._attitude = self._corrected(attitude, gyro, accel, mag, interval)
             return AttitudeEstimate(self._with_yaw(self._attitude), self._bias.bias)
-        self._attitude = attitude
-        found = self._found(self._recovery, attitude, gyro, accel, mag, interval)
-        return AttitudeEstimate(self._with_yaw(found), self._bias.bias)
+        recovery, self._attitude = self._recovery, attitude
+        found = self._found(recovery, attitude, gyro, accel, mag, interval)
+        if recovery.over:
+            self._attitude, _ = self._with_recovery_ended(recovery, attitude)
+        return AttitudeEstimate(self._with_yaw(found), self._bias.bias, recovery.spread)
 
     def _less_lag(self, attitude: Quaternion, gyro: Vector, mag: Vector, interval: float) -> Vector:
         """The magnetometer's reading, without what it lags behind the gyro."""
@@ -138,16 +150,19 @@ class AttitudeFilter:
 
     def _over_hole(self, before: Quaternion, interval: float, gyro: Vector, spread: float) -> tuple[Quaternion, float]:
         """By the turn rates at both ends, until it is known how they went on changing."""
-        self._unseen.begin(interval, gyro)
+        unknown = None
+        if self._recovery is not None:
+            before, unknown = self._with_recovery_ended(self._recovery, before)
+        self._unseen.begin(interval)
         attitude = before
         if interval <= LONGEST_INTERVAL:
             (ax, ay, az), (bx, by, bz) = self._gyro, gyro
             attitude = self._turned(before, (0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz)), interval)
         elif spread == 0.0:  # a sensor that is always that slow
             spread = math.inf
-        self._bridged = _Bridged(before, attitude, interval)
-        if spread > SMALLEST or self._recovery is not None:
-            self._begin_recovery(spread)
+        self._bridged = _Bridged(before, attitude, interval, unknown)
+        if spread > SMALLEST or unknown is not None:
+            self._begin_recovery(_sum(alike(spread), unknown))
             interval = 0.0
         return attitude, interval
 
@@ -156,17 +171,17 @@ class AttitudeFilter:
         found = self._unseen.found()
         if found is None or self._bridged is None:
             return attitude
-        turn, spread = found
-        before, bridged, lasted = self._bridged
+        before, bridged, lasted, unknown = self._bridged
         bx, by, bz = self._bias.bias
         drift = from_rotation_vector((-lasted * bx, -lasted * by, -lasted * bz))
-        missing = multiply(multiply(multiply(before, turn), drift), conjugate(bridged))
+        missing = multiply(multiply(multiply(before, found.turn), drift), conjugate(bridged))
         self._bridged = None
         if self._recovery is not None:
             self._recovery = None
             self._heading.close(self._opened)
-            if spread > SMALLEST:
-                self._begin_recovery(spread)
+            covariance = _sum(turned_about(before, found.covariance), unknown)
+            if largest_spread(covariance) > SMALLEST:
+                self._begin_recovery(covariance)
         return normalized(multiply(missing, attitude))
 
     def _turned(self, attitude: Quaternion, rate: Vector, interval: float) -> Quaternion:
@@ -176,14 +191,14 @@ class AttitudeFilter:
         turn = from_rotation_vector((interval * (x - bx), interval * (y - by), interval * (z - bz)))
         return normalized(multiply(attitude, turn))
 
-    def _begin_recovery(self, spread: float) -> None:
-        """What the turn rate may have done in a hole; what was not yet found of the one before adds to it."""
-        if self._recovery is not None:
-            spread = math.hypot(spread, self._recovery.spread)
-            self._end_recovery()
+    def _begin_recovery(self, covariance: Covariance | None) -> None:
+        """Look for a rotation of the world of which so much is known before; None: nothing."""
         self._rest.restart()
-        self._recovery = Recovery(spread, self._holes.speed, self._heading.undisturbed())
-        self._opened = self._heading.open(spread / FIELD_ERROR)
+        self._wander.restart()
+        tilt = self._wander.error(self._holes.speed)
+        self._recovery = Recovery(covariance, tilt, self._heading.undisturbed())
+        about_vertical = math.inf if covariance is None else math.sqrt(float(covariance[2, 2]))
+        self._opened = self._heading.open(about_vertical / FIELD_ERROR)
 
     def _found(
         self,
@@ -203,20 +218,16 @@ class AttitudeFilter:
                 row = vertical_row(found, self._bias.bias)
                 self._heading.update(rotate(found, mag), row, gyro, self._since_field, levelled=False)
             self._since_field = 0.0
-        if recovery.over:
-            self._end_recovery()
         return found
 
-    def _end_recovery(self) -> None:
-        """The filters of the steady state go on from the rotation that was found."""
-        assert self._recovery is not None
-        assert self._attitude is not None
-        self._attitude = normalized(multiply(self._recovery.turn, self._attitude))
-        self._gravity.restart(self._recovery.force, self._recovery.elapsed)
-        if self._recovery.has_field:
-            self._heading.averaged(self._recovery.elapsed)
+    def _with_recovery_ended(self, recovery: Recovery, attitude: Quaternion) -> tuple[Quaternion, Covariance]:
+        """The attitude with the rotation that was found, from which the steady state goes on, and its covariance."""
+        self._gravity.restart(recovery.force, recovery.elapsed)
+        if recovery.has_field:
+            self._heading.averaged(recovery.elapsed)
         self._since_accel = self._since_field = 0.0
         self._recovery = None
+        return normalized(multiply(recovery.turn, attitude)), recovery.covariance
 
     def _corrected(
         self, attitude: Quaternion, gyro: Vector, accel: Vector | None, mag: Vector | None, interval: float
@@ -226,7 +237,10 @@ class AttitudeFilter:
         self._since_field += interval
         if accel is not None:
             rows = horizontal_rows(attitude, self._bias.bias)
-            correction = self._gravity.update(rotate(attitude, accel), rows, self._since_accel)
+            force = rotate(attitude, accel)
+            if self._gravity.levelled:
+                self._wander.take(force, self._since_accel)
+            correction = self._gravity.update(force, rows, self._since_accel)
             self._since_accel = 0.0
             if correction is not None:
                 attitude = multiply(correction, attitude)
@@ -259,12 +273,18 @@ class AttitudeFilter:
         return normalized(multiply(from_yaw(self._heading.offset), attitude))
 
 
+def _sum(one: Covariance | None, other: Covariance | None) -> Covariance | None:
+    """Of the hole's own turn, None where it may be any, and of what was unknown before, if anything was."""
+    return one if one is None or other is None else one + other
+
+
 class _Bridged(NamedTuple):
     """The attitudes at both ends of a hole, as they were taken, and how long it was."""
 
     before: Quaternion
     after: Quaternion
     lasted: float  # s
+    unknown: Covariance | None  # of the attitude before, after another hole
 
 
 class _Gravity:

@@ -3,13 +3,18 @@
 Nothing tells how the body turned in a hole. From its end on the gyro turns the attitude exactly again, so one
 rotation of the world is all that is wrong, the same until it is found. Each reading tells of it, turned into that
 world and averaged there: the magnetic field at once and whatever the motion, all but the angle about the field;
-the specific force the better the longer it lasts, since speeds are bounded: its mean over t is gravity up to v / t.
+the specific force the better the longer it lasts (mean_force).
 """
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 from caneflow.algorithms.inertial.initial_attitude import SHORTEST_VECTOR
+from caneflow.algorithms.inertial.mean_force import MeanForce, TiltError, expected_speed
 from caneflow.algorithms.rotations import (
     IDENTITY,
     Quaternion,
@@ -20,6 +25,8 @@ from caneflow.algorithms.rotations import (
     rotate,
 )
 from caneflow.physics import GRAVITY
+
+Covariance: TypeAlias = npt.NDArray[np.float64]  # (3, 3) rad^2, of a small rotation of the world
 
 SHORTEST_HOLE = 0.04  # s; below, the turn rates at both ends tell the turn well enough
 HOLE = 2.5  # usual intervals, and more, are a hole
@@ -35,10 +42,8 @@ LEAST_WEIGHT = 1e-6  # 1/rad^2, of the turn that was found: what nothing tells o
 LEAST_FIELD_ERROR = math.radians(2.0)  # rad, however long it is averaged
 SMALLEST = math.radians(2.0)  # rad; a smaller spread is left to the filters of the steady state
 FIELD_ERROR = math.radians(4.0)  # rad, sd of a field's mean direction over 1 s: disturbances too weak to be seen
-# m/s, sd of what a speed changes by: at least that of a walk, and this time (s) times the force's RMS off gravity.
-LEAST_SPEED, SPEED_TIME = 0.5, 0.25
 MOTION_MEMORY = 2.0  # s, of that RMS
-SOONEST = 0.1  # s, the least time over which the force is taken to be averaged
+SOONEST = 0.1  # s, the least time over which the field is taken to be averaged
 RECOVERY = 5.0  # s, after which the filters of the steady state take over
 
 
@@ -55,7 +60,7 @@ class Holes:
     @property
     def speed(self) -> float:
         """m/s, sd of what the body's speed changes by in its present motion."""
-        return LEAST_SPEED + SPEED_TIME * math.sqrt(self._shaking)
+        return expected_speed(math.sqrt(self._shaking))
 
     def spread(self, interval: float, gyro: Vector, accel: Vector | None) -> float:
         """rad, sd of the turn that nobody saw in the `interval` (s) before a reading; 0 where it is a usual one.
@@ -93,6 +98,16 @@ class Holes:
         return spread if spread < LARGEST_SPREAD else math.inf
 
 
+def alike(spread: float) -> Covariance | None:
+    """The covariance of a rotation about whose axes the same is known: `spread` in rad, None where it is infinite."""
+    return None if math.isinf(spread) else spread * spread * np.eye(3)
+
+
+def largest_spread(covariance: Covariance | None) -> float:
+    """rad, about the least known of the three axes; infinite without one."""
+    return math.inf if covariance is None else math.sqrt(float(np.diag(covariance).max()))
+
+
 @dataclass(frozen=True, kw_only=True)
 class UndisturbedField:
     """What the magnetic field was before the hole."""
@@ -105,15 +120,17 @@ class UndisturbedField:
 class Recovery:
     """Finds the rotation of the world that is missing since a hole."""
 
-    def __init__(self, spread: float, speed: float, field: UndisturbedField | None) -> None:
-        """`spread` in rad, infinite when nothing is known; `speed` in m/s; `field` where one can be trusted."""
-        self._variance = spread * spread
-        self._speed = speed
+    def __init__(self, covariance: Covariance | None, tilt: TiltError, field: UndisturbedField | None) -> None:
+        """What it may be, None where nothing is known; what a mean force tells; `field` where one can be trusted."""
+        self._weights = np.zeros((3, 3)) if covariance is None else np.linalg.inv(covariance)
+        self._tilt = tilt
         self._reference = field
-        self._force: Vector = (0.0, 0.0, 0.0)
+        self._force = MeanForce()
         self._field: Vector = (0.0, 0.0, 0.0)
-        self._forces = self._fields = 0
+        self._fields = 0
         self._begun = False
+        self._since_force = 0.0  # s
+        self._precision = self._weights + LEAST_WEIGHT * np.eye(3)  # of what has been found
         self.elapsed = 0.0  # s
         self.turn: Quaternion = IDENTITY  # of the world, from the attitude given to the true one
 
@@ -123,23 +140,30 @@ class Recovery:
         return self.elapsed >= RECOVERY
 
     @property
+    def covariance(self) -> Covariance:
+        """(3, 3) rad^2, of what is still unknown, in the world."""
+        return np.linalg.inv(self._precision).astype(np.float64)
+
+    @property
     def spread(self) -> float:
-        """rad, sd of what is still unknown."""
-        return math.sqrt(1.0 / (1.0 / self._variance + 1.0 / self._tilt_variance()))
+        """rad, largest sd of what is still unknown; about the vertical only where a field could tell."""
+        variances = np.diag(self.covariance)
+        return math.sqrt(float(max(variances[: 2 if self._reference is None else 3])))
 
     @property
     def force(self) -> Vector:
         """Mean specific force since the hole, m/s^2, in the true world."""
-        return rotate(self.turn, _scaled(self._force, 1.0 / max(self._forces, 1)))
+        return rotate(self.turn, self._force.mean)
 
     def update(self, attitude: Quaternion, accel: Vector | None, mag: Vector | None, interval: float) -> None:
         """Take a reading in the body frame, `attitude` being the gyro's since the hole; `interval` in s."""
         if self._begun:  # the first reading ends the hole
             self.elapsed += interval
+            self._since_force += interval
         self._begun = True
         if accel is not None:
-            self._force = _added(self._force, rotate(attitude, accel))
-            self._forces += 1
+            self._force.take(rotate(attitude, accel), self._since_force)
+            self._since_force = 0.0
         if mag is not None:
             self._field = _added(self._field, rotate(attitude, mag))
             self._fields += 1
@@ -148,8 +172,9 @@ class Recovery:
     def _find(self) -> None:
         """Least squares over the three angles, by Gauss and Newton; from sample to sample one step is enough."""
         wanted = []
-        if math.hypot(*self._force) > SHORTEST_VECTOR:
-            wanted.append((self._force, UP, 1.0 / self._tilt_variance()))
+        force = self._force.mean
+        if math.hypot(*force) > SHORTEST_VECTOR:
+            wanted.append((force, UP, 1.0 / self._tilt.variance(self._force.lasted)))
         if (reference := self._trusted()) is not None:
             wanted.append((self._field, reference, 1.0 / self._field_variance()))
         for _ in range(MOST_STEPS):
@@ -160,23 +185,14 @@ class Recovery:
 
     def _step(self, wanted: list[tuple[Vector, Vector, float]]) -> Vector:
         """The rotation, rad, that brings each direction nearer to the one it should have, by their weights."""
-        weight = 1.0 / self._variance
-        x, y, z = _rotation_vector(self.turn)
-        gx, gy, gz = -weight * x, -weight * y, -weight * z
-        xx = yy = zz = weight + LEAST_WEIGHT
-        xy = xz = yz = 0.0
-        for seen, (a, b, c), weight in wanted:
-            ex, ey, ez = _turn_to(rotate(self.turn, seen), (a, b, c))
-            gx, gy, gz = gx + weight * ex, gy + weight * ey, gz + weight * ez
-            xx, yy, zz = xx + weight * (1.0 - a * a), yy + weight * (1.0 - b * b), zz + weight * (1.0 - c * c)
-            xy, xz, yz = xy - weight * a * b, xz - weight * a * c, yz - weight * b * c
-        cx, cy, cz = yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz
-        determinant = xx * cx + xy * cy + xz * cz
-        return (
-            (cx * gx + cy * gy + cz * gz) / determinant,
-            (cy * gx + (xx * zz - xz * xz) * gy + (xy * xz - xx * yz) * gz) / determinant,
-            (cz * gx + (xy * xz - xx * yz) * gy + (xx * yy - xy * xy) * gz) / determinant,
-        )
+        gradient = -self._weights @ np.array(_rotation_vector(self.turn))
+        precision = self._weights + LEAST_WEIGHT * np.eye(3)
+        for seen, direction, weight in wanted:
+            gradient += weight * np.array(_turn_to(rotate(self.turn, seen), direction))
+            precision += weight * (np.eye(3) - np.outer(direction, direction))
+        self._precision = precision
+        x, y, z = np.linalg.solve(precision, gradient).tolist()
+        return x, y, z
 
     @property
     def has_field(self) -> bool:
@@ -192,9 +208,6 @@ class Recovery:
 
     def _field_variance(self) -> float:
         return max(FIELD_ERROR**2 / (self.elapsed + SOONEST), LEAST_FIELD_ERROR**2)
-
-    def _tilt_variance(self) -> float:
-        return (self._speed / (GRAVITY * max(self.elapsed, SOONEST))) ** 2
 
 
 def _added(one: Vector, other: Vector) -> Vector:

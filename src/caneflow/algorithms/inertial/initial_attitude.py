@@ -17,6 +17,7 @@ class AttitudeEstimate(NamedTuple):
 
     orientation: Quaternion  # w x y z, body to world
     gyro_bias: Vector  # rad/s, body; what the filter takes off the gyro
+    spread: float = 0.0  # rad, sd of what is still unknown since a hole in the samples
 
 
 class AttitudeMethod(Protocol):

@@ -11,9 +11,17 @@ turned would stay wrong for long, or for good; for some seconds after one, attit
 import math
 from dataclasses import dataclass
 
-from caneflow.algorithms.inertial.attitude_recovery import LEAST_LEVEL, SMALLEST, Holes, Recovery, UndisturbedField
+from caneflow.algorithms.inertial.attitude_recovery import (
+    LEAST_LEVEL,
+    SMALLEST,
+    Holes,
+    Recovery,
+    UndisturbedField,
+    alike,
+)
 from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleClock
 from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, initial_attitude, required_start
+from caneflow.algorithms.inertial.mean_force import TiltError
 from caneflow.algorithms.quantities import Density, TurnRate, Zero
 from caneflow.algorithms.rotations import (
     Quaternion,
@@ -76,7 +84,8 @@ class Madgwick:
             self._orientation = self._turned(self._orientation, gyro, accel, mag, interval, hole=hole)
         self._gyro = gyro
         if self._recovery is not None:
-            return AttitudeEstimate(self._recovered(self._recovery, accel, mag, interval), self._bias)
+            recovery = self._recovery
+            return AttitudeEstimate(self._recovered(recovery, accel, mag, interval), self._bias, recovery.spread)
         return AttitudeEstimate(self._orientation, self._bias)
 
     def _turned(
@@ -97,7 +106,7 @@ class Madgwick:
             if self._recovery is not None:
                 spread = math.hypot(spread, self._recovery.spread)
                 self._end_recovery(self._recovery)
-            self._recovery = Recovery(spread, self._holes.speed, self._undisturbed())
+            self._recovery = Recovery(alike(spread), TiltError(self._holes.speed), self._undisturbed())
         return spread > 0.0
 
     def _bridged(self, q: Quaternion, gyro: Vector, interval: float) -> Quaternion:

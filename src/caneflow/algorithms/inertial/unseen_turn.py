@@ -1,14 +1,17 @@
-"""How a body turned while no samples came, from the turn rates and their changes at both ends of the hole.
+"""How a body turned while no samples came, from the turn rates at both ends of the hole.
 
-The trapezium rule takes the turn rate to change evenly; its first correction, T^2 / 12 (change before - change after),
-is exact for a cubic course. A smooth motion is told six times better with it, a jerky one worse. Which one this is has
-just been seen: the same hole is made up in the seconds before, again and again, and the correction gets the share that
-fits there. What is left there says how wrong the turn may be.
+A motion of a hand or a foot is smooth and repeats itself: how the turn rates in a hole follow from those before and
+after it has been seen in the seconds before. It is learnt there by least squares, all three axes alike, as a departure
+from the straight line between both ends, and what is left there says how wrong the turn may be. A swing is told to
+a degree over half a second, a jerky motion hardly better than by the straight line.
 """
 
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 from caneflow.algorithms.rotations import (
     IDENTITY,
@@ -17,144 +20,145 @@ from caneflow.algorithms.rotations import (
     from_rotation_vector,
     multiply,
     normalized,
+    rotate,
 )
 
-REMEMBERED = 2.5  # s before the hole on which it is tried
+Array: TypeAlias = npt.NDArray[np.float64]
+
+KNOT = 0.01  # s, between which turn rates are averaged
+REMEMBERED = 450  # knots before the hole
+BIN = 0.02  # s, roughly, of which a hole is made up; a whole number of bins fills it
+BEFORE, AFTER = 10, 5  # bins at both ends that tell of the hole
 LONGEST_HOLE = 1.0  # s
-SLOPE = 0.02  # s over which a change of the turn rate is taken
-TRIALS, FEWEST_TRIALS = 16, 6
-MARGIN = 1.5  # times what was left in the trials: they are few, and overlap
-STEPS = 16  # in which the course over the hole is integrated
+FEWEST_WINDOWS = 50  # of the seconds before; each axis of each is one example, and they overlap
+RIDGE = 1e-5  # of the rates' mean square: the weight of the straight line
+MARGIN = 1.5  # times what was left in the examples, sd: they were fitted, and overlap
 
 
-class _Reading(NamedTuple):
+class TurnFound(NamedTuple):
+    """The turn in a hole."""
+
+    turn: Quaternion  # of the body, from the hole's begin to its end
+    covariance: Array  # (3, 3) rad^2, of a small rotation in the body as it was at the hole's begin
+
+
+class _Knot(NamedTuple):
     time: float  # s
-    gyro: Vector  # rad/s
-    turned: Vector  # rad, sum since the history began
+    x: float  # rad, sum since the start
+    y: float
+    z: float
 
 
 class _Hole(NamedTuple):
-    lasted: float  # s
-    before: Vector  # rad/s
-    change: Vector  # rad/s^2, before
-    after: Vector  # rad/s
-    share: float  # of the correction
-    spread: float  # rad
+    width: float  # s, of a bin
+    before: Array  # (BEFORE, 3) rad/s
+    weights: Array  # (BEFORE + AFTER, bins): how the rates in it follow from those before and after
+    squares: Array  # (3, 3) rad^2, what was left of the turn in the examples
 
 
 class UnseenTurn:
     """Remembers the last seconds of turn rates; told of a hole, it says some readings later how the body turned."""
 
     def __init__(self) -> None:
-        self._history: deque[_Reading] = deque()
+        self._knots: deque[_Knot] = deque(maxlen=REMEMBERED)
+        self._now = _Knot(0.0, 0.0, 0.0, 0.0)
+        self._next = KNOT  # s, of the next knot
         self._hole: _Hole | None = None
+        self._ended = 0.0  # s, of the hole
 
     def take(self, interval: float, gyro: Vector) -> None:
-        """A reading (rad/s) after a usual `interval` (s)."""
-        history = self._history
-        if not history:
-            history.append(_Reading(0.0, gyro, (0.0, 0.0, 0.0)))
-            return
-        time, _, (x, y, z) = history[-1]
-        turned = x + interval * gyro[0], y + interval * gyro[1], z + interval * gyro[2]
-        history.append(_Reading(time + interval, gyro, turned))
-        while history[-1].time - history[0].time > REMEMBERED:
-            history.popleft()
+        """A reading (rad/s), which counts for the usual `interval` (s) before it."""
+        p, q, r = gyro
+        time, x, y, z = self._now
+        self._now = _Knot(time + interval, x + interval * p, y + interval * q, z + interval * r)
+        while self._next <= self._now.time:
+            since = self._next - time
+            self._knots.append(_Knot(self._next, x + since * p, y + since * q, z + since * r))
+            self._next += KNOT
 
-    def begin(self, interval: float, gyro: Vector) -> None:
-        """A reading after a hole of `interval` s."""
-        self._hole = self._tried(interval, gyro) if interval <= LONGEST_HOLE else None
-        self._history.clear()
-        self.take(0.0, gyro)
+    def begin(self, interval: float) -> None:
+        """The next reading comes after a hole of `interval` s."""
+        self._hole = None
+        if interval > LONGEST_HOLE:
+            self._knots.clear()
+        else:
+            self._knots.append(self._now)
+            self._hole = _learnt(np.array(self._knots), interval)
+        self._ended = self._now.time + interval
+        self._now = self._now._replace(time=self._ended)
+        self._next = self._ended + KNOT
+        self._knots.append(self._now)
 
-    def found(self) -> tuple[Quaternion, float] | None:
-        """The turn in the last hole, in the body, and its sd (rad), once: when enough has been read since."""
-        if self._hole is None or self._history[-1].time < SLOPE:
+    def found(self) -> TurnFound | None:
+        """The turn in the last hole, once: when enough has been read since."""
+        hole = self._hole
+        if hole is None or self._now.time < self._ended + AFTER * hole.width:
             return None
-        hole, self._hole = self._hole, None
-        first, last = self._history[0], self._history[-1]
-        return _course(hole, _slope(first, last)), hole.spread
-
-    def _tried(self, interval: float, gyro: Vector) -> _Hole | None:
-        """The hole, with what the same one would have been like in the seconds before; None where there are too few."""
-        history = list(self._history)
-        if not history:
-            return None
-        explained = explaining = missed = 0.0
-        trials, room = 0, history[-1].time - history[0].time - interval - 2.0 * SLOPE
-        if room <= 0.0:
-            return None
-        places = [history[0].time + SLOPE + room * k / (TRIALS - 1) for k in range(TRIALS)]
-        end = iter(places)
-        index = 0
-        for place in end:
-            while history[index].time < place:
-                index += 1
-            trial = _trial(history, index, interval)
-            if trial is None:
-                continue
-            error, correction = trial
-            explained += _dot(error, correction)
-            explaining += _dot(correction, correction)
-            missed += _dot(error, error)
-            trials += 1
-        if trials < FEWEST_TRIALS:
-            return None
-        share = min(max(explained / explaining, 0.0), 1.0) if explaining > 0.0 else 0.0
-        left = max(missed - share * (2.0 * explained - share * explaining), 0.0)
-        first = next(k for k in range(len(history) - 1, -1, -1) if history[-1].time - history[k].time >= SLOPE)
-        change = _slope(history[first], history[-1])
-        return _Hole(interval, history[-1].gyro, change, gyro, share, MARGIN * math.sqrt(left / trials))
+        self._hole = None
+        knots = np.array([knot for knot in self._knots if knot.time >= self._ended] + [self._now])
+        after = _rates(knots, self._ended + hole.width * np.arange(AFTER + 1.0))
+        rates = hole.weights.T @ np.concatenate((hole.before, after))
+        return _course(rates, hole.width, hole.squares)
 
 
-def _trial(history: list[_Reading], begin: int, lasting: float) -> tuple[Vector, Vector] | None:
-    """By how much (rad) the trapezium rule is off over a hole that begins at a reading, and what the correction is."""
-    end = _after(history, begin, history[begin].time + lasting)
-    later = _after(history, end, history[min(end, len(history) - 1)].time + SLOPE)
-    if later >= len(history):
+def _rates(knots: Array, edges: Array) -> Array:
+    """Mean turn rates (bins, 3), rad/s, between `edges`; NaN where samples were missing."""
+    times = knots[:, 0]
+    turned = np.stack([np.interp(edges, times, knots[:, axis]) for axis in (1, 2, 3)], axis=1)
+    part = np.concatenate(([0.0], np.cumsum(np.diff(times) > 1.5 * KNOT)))
+    begun = np.interp(edges, times, part, left=math.nan)
+    rates = np.diff(turned, axis=0) / np.diff(edges)[:, None]
+    rates[np.diff(begun) != 0.0] = math.nan
+    return rates
+
+
+def _learnt(knots: Array, lasted: float) -> _Hole | None:
+    """How a hole of `lasted` s that begins at the last of the knots (n, 4) is filled; None if too little is known."""
+    bins = max(round(lasted / BIN), 1)
+    width, length = lasted / bins, BEFORE + bins + AFTER
+    end = knots[-1, 0]
+    count = int((end - knots[0, 0]) / width)
+    if count < length:
         return None
-    earlier = begin
-    while earlier > 0 and history[begin].time - history[earlier].time < SLOPE:
-        earlier -= 1
-    (start, before, turned_before), (stop, after, turned_after) = history[begin], history[end]
-    lasted = stop - start
-    changes = _slope(history[earlier], history[begin]), _slope(history[end], history[later])
-    error, correction = [], []
-    for axis in range(3):
-        evenly = 0.5 * lasted * (before[axis] + after[axis])
-        error.append(turned_after[axis] - turned_before[axis] - evenly)
-        correction.append(lasted * lasted / 12.0 * (changes[0][axis] - changes[1][axis]))
-    return (error[0], error[1], error[2]), (correction[0], correction[1], correction[2])
+    rates = _rates(knots, end + width * np.arange(-count, 1.0))
+    windows = np.lib.stride_tricks.sliding_window_view(rates, length, axis=0)
+    windows = windows[np.isfinite(windows).all(axis=(1, 2))]
+    before = rates[-BEFORE:]
+    if len(windows) < FEWEST_WINDOWS or not np.isfinite(before).all():
+        return None
+    examples = windows.reshape(-1, length)
+    given, wanted = examples[:, np.r_[0:BEFORE, BEFORE + bins : length]], examples[:, BEFORE : BEFORE + bins]
+    products = given.T @ given
+    products += (RIDGE * np.trace(products) / len(products) + np.finfo(float).tiny) * np.eye(len(products))
+    line = _straight_line(bins)
+    left = wanted - given @ line
+    weights = np.linalg.solve(products, given.T @ left)
+    turned = width * (left - given @ weights).sum(axis=1).reshape(-1, 3)
+    return _Hole(width, before, line + weights, MARGIN**2 * (turned.T @ turned) / len(turned))
 
 
-def _after(history: list[_Reading], index: int, time: float) -> int:
-    while index < len(history) and history[index].time < time - 1e-9:
-        index += 1
-    return index
+def _straight_line(bins: int) -> Array:
+    """Weights (BEFORE + AFTER, bins) of the rates at both ends, by which the last and the first are joined."""
+    share = (np.arange(bins) + 1.0) / (bins + 1.0)
+    weights = np.zeros((BEFORE + AFTER, bins))
+    weights[BEFORE - 1], weights[BEFORE] = 1.0 - share, share
+    return weights
 
 
-def _slope(one: _Reading, other: _Reading) -> Vector:
-    lasted = other.time - one.time
-    if lasted <= 0.0:
-        return 0.0, 0.0, 0.0
-    (ax, ay, az), (bx, by, bz) = one.gyro, other.gyro
-    return (bx - ax) / lasted, (by - ay) / lasted, (bz - az) / lasted
+def _course(rates: Array, width: float, squares: Array) -> TurnFound:
+    """The turn at these rates, and its covariance: an error may lie anywhere on the way."""
+    turn, covariance = IDENTITY, np.zeros((3, 3))
+    for x, y, z in (0.5 * width * rates).tolist():
+        half = from_rotation_vector((x, y, z))
+        middle = multiply(turn, half)
+        covariance += turned_about(middle, squares) / len(rates)
+        turn = multiply(middle, half)
+    bent = (0.5 * np.trace(covariance)) ** 2  # a turn by an unknown angle bends what is told of the other axes
+    return TurnFound(normalized(turn), covariance + bent * np.eye(3))
 
 
-def _course(hole: _Hole, change_after: Vector) -> Quaternion:
-    """The turn over the hole: an even course, and a share of the cubic one's difference from it."""
-    turn, step = IDENTITY, hole.lasted / STEPS
-    for k in range(STEPS):
-        s = (k + 0.5) / STEPS
-        rise, fall = hole.lasted * s * (1.0 - s) ** 2, hole.lasted * s * s * (1.0 - s)
-        bend = s * (1.0 - s) * (2.0 * s - 1.0)
-        rate = []
-        for a, b, u, v in zip(hole.before, hole.after, hole.change, change_after, strict=True):
-            evenly = a + s * (b - a)
-            rate.append(evenly + hole.share * (bend * (b - a) + rise * u - fall * v))
-        turn = multiply(turn, from_rotation_vector((step * rate[0], step * rate[1], step * rate[2])))
-    return normalized(turn)
-
-
-def _dot(one: Vector, other: Vector) -> float:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+def turned_about(orientation: Quaternion, covariance: Array) -> Array:
+    """The covariance (3, 3) of a vector in the body as one in the world."""
+    axes = np.array([rotate(orientation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]).T
+    turned: Array = axes @ covariance @ axes.T
+    return turned
