@@ -10,20 +10,17 @@ import logging
 import queue
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import msgspec
-from annotated_types import Ge, Le
 
 from caneflow.algorithms.quantities import Milliseconds
-from caneflow.errors import CaneflowError, not_installed
 from caneflow.messages import Imu, MessageError
 from caneflow.messages.rig import Guidance
 from caneflow.protocols.device_motion import Batch, motion_of
 from caneflow.runtime import Brought, Context, Quiet, Source
-from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.node import run
+from caneflow.viewing.phone_page import PhonePageSettings, page_server, squares_of
 
 log = logging.getLogger(__name__)
 
@@ -34,14 +31,9 @@ GAP_NS: Final = 200_000_000  # ns between two readings, which is told
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhoneSettings:
-    """Where the page is."""
+class PhoneSettings(PhonePageSettings):
+    """Where the page is, and how well the clocks have to be compared."""
 
-    __pydantic_config__ = {"extra": "forbid"}
-
-    listen: str = "127.0.0.1"  # an address of this machine; any other than loopback needs keys/page.crt
-    port: Annotated[int, Ge(0), Le(65535)] = 0  # 0: any that is free
-    keys: str = "keys"  # the folder with page.crt and page.key
     worst_clock_ms: Milliseconds = 20.0  # ms of round trip up to which the clocks count as compared
 
 
@@ -56,25 +48,14 @@ class Phone(Source):
         self._last = 0  # ns: stamp of the last sample, or until when nothing was promised
         self._sample = 0  # ns: stamp of the last sample
         self._lost = 0  # readings that the page has lost, as it says
+        self._unheard = 0  # messages that came faster than they could be taken
         self.refused: dict[str, int] = {}  # readings left out, by cause
 
     def samples(self) -> Brought:
-        """Yield readings as they come; raises DataflowError where the page cannot be served."""
-        try:
-            from caneflow.viewing.phone_server import PhoneServer, certificate_in, in_squares
-        except ModuleNotFoundError as error:
-            raise DataflowError(not_installed(str(error.name), "phone")) from error
-        settings = self._settings
-        tls = certificate_in(Path(settings.keys))
-        try:
-            server = PhoneServer(
-                Guidance(), hears=False, senses=True, listen=settings.listen, port=settings.port, tls=tls
-            )
-        except CaneflowError as error:
-            raise DataflowError(str(error)) from error
-        with server:
+        """Yield readings as they come; raises CaneflowError where the page cannot be served."""
+        with page_server(self._settings, Guidance(), hears=False, senses=True) as server:
             log.info("the phone's page is at %s", server.address)
-            for line in in_squares(server.address).splitlines():
+            for line in squares_of(server):
                 log.info("%s", line)
             try:
                 while True:
@@ -84,6 +65,7 @@ class Phone(Source):
                         self._last = max(self._last, time.time_ns() - MARGIN_NS)
                         yield Quiet(self._last)
                     else:
+                        self._note_unheard(server.unheard)
                         for sample in self.taken(came.said, came.arrival):
                             yield "imu", sample
             finally:
@@ -95,7 +77,7 @@ class Phone(Source):
         try:
             batch = msgspec.convert(said, Batch)
         except msgspec.ValidationError as error:
-            self._refuse(f"not readings: {error}", 1)
+            self._refuse("not readings", 1, error)
             return []
         if batch.lost > self._lost:
             log.warning("%d readings were lost on the phone while there was no link", batch.lost - self._lost)
@@ -120,7 +102,7 @@ class Phone(Source):
                         orientation=motion.orientation,
                     )
                 except (MessageError, ValueError) as error:
-                    self._refuse(str(error), 1)
+                    self._refuse("not what an IMU measures", 1, error)
                     continue
                 if self._sample and motion.stamp - self._sample > GAP_NS:
                     log.warning("no reading for %.1f s", (motion.stamp - self._sample) * 1e-9)
@@ -128,7 +110,15 @@ class Phone(Source):
                 samples.append(sample)
         return samples
 
-    def _refuse(self, cause: str, count: int) -> None:
+    def _note_unheard(self, unheard: int) -> None:
+        if unheard > self._unheard:
+            log.warning("%d messages of the page came faster than they could be taken", unheard - self._unheard)
+            self._unheard = unheard
+
+    def _refuse(self, cause: str, count: int, found: object = "") -> None:
+        """Count readings by their cause; `found`: what is wrong with the first of them, which is told."""
+        if found and cause not in self.refused:
+            log.warning("%s: %s", cause, found)
         self.refused[cause] = self.refused.get(cause, 0) + count
 
 

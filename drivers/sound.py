@@ -26,6 +26,7 @@ from caneflow.algorithms.surroundings.sonification import RATE, HearingSettings,
 from caneflow.errors import not_installed
 from caneflow.messages import Cue, MessageError, Sample, decode
 from caneflow.messages.rig import Guidance, User
+from caneflow.outputs import require_free
 from caneflow.runtime import Context, Sink
 from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.node import run
@@ -49,7 +50,7 @@ class SoundSettings:
     __pydantic_config__ = {"extra": "forbid"}
 
     device: str | None = None  # as PortAudio names it, or a part of that; None: the system's
-    file: str | None = None  # of a replay: the WAV file to write; without it a replay is silent
+    file: str | None = None  # of a replay: the WAV file to write, a new one; without it a replay is silent
     say: bool = False  # live: in words as well, through espeak-ng
     words_per_minute: Annotated[int, Ge(80), Le(450)] = 220  # of espeak-ng
 
@@ -81,6 +82,8 @@ class CueSound(Sink):
             if settings.say:
                 self._speech = _speech(settings.words_per_minute)
         elif self._file is not None:
+            if not context.takes_over:
+                require_free(self._file)
             self._log = CueLog(self._file.with_name(f"{self._file.name}.cues"), goes_on=context.takes_over)
 
     def take(self, key: str, message: Sample, payload: bytes, time: int) -> None:

@@ -66,11 +66,9 @@ class EgoVelocityOperator(Operator):
         except ValueError as error:
             raise Refused(str(error)) from error
         self._imu_ns = imu.stamp
-        gyro, accel, _, orientation, _ = self._gate.update(
-            imu.stamp, ImuReading(imu.gyro, imu.accel, orientation=imu.orientation)
-        )
-        if orientation is not None:
-            self._motion.imu(imu.stamp, orientation, gyro, accel)
+        reading = self._gate.update(imu.stamp, ImuReading(imu.gyro, imu.accel, orientation=imu.orientation))
+        if reading.orientation is not None:
+            self._motion.imu(imu.stamp, reading.orientation, reading.gyro, reading.accel)
 
     def _speed(self, points: RadarPoints) -> GroundSpeed:
         if self._points_ns is not None and points.stamp <= self._points_ns:

@@ -77,13 +77,11 @@ class GroundSpeedOperator(Operator):
         except ValueError as error:
             raise Refused(str(error)) from error
         self._last_ns = imu.stamp
-        gyro, accel, _, orientation, _ = self._gate.update(
-            imu.stamp, ImuReading(imu.gyro, imu.accel, orientation=imu.orientation)
-        )
-        if orientation is not None:
-            self._attitudes.add(imu.stamp, orientation, gyro)
+        reading = self._gate.update(imu.stamp, ImuReading(imu.gyro, imu.accel, orientation=imu.orientation))
+        if reading.orientation is not None:
+            self._attitudes.add(imu.stamp, reading.orientation, reading.gyro)
             if self._velocity is not None:
-                self._velocity.imu(imu.stamp, orientation, accel)
+                self._velocity.imu(imu.stamp, reading.orientation, reading.accel)
 
     def _speed(self, frame: RadarFrame) -> GroundSpeed:
         described = DESCRIPTION(frame)

@@ -3,11 +3,10 @@
 import math
 import os
 import re
-import shutil
 import ssl
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,12 @@ from caneflow.messages.rig import Guidance, Rig
 from caneflow.protocols.device_motion import orientation_of
 from caneflow.runtime import Context, Quiet
 from drivers.phone import Phone, PhoneSettings
+from tests.browser import DEADLINE, running_browser, until  # noqa: F401 - the fixture `browser`
 from tests.flows import launchers
 
-pytest.importorskip("playwright", reason="playwright is not installed here (pip install 'caneflow[dev]')")
 phone_server = pytest.importorskip("caneflow.viewing.phone_server", reason="the extra `view` is not installed here")
-from playwright.sync_api import Browser, Page, sync_playwright  # noqa: E402
+from playwright.sync_api import Browser, Page  # noqa: E402
 
-CHROMIUM = shutil.which("chromium")
-DEADLINE = 30.0  # s
 MOTION = """(rate) => {
   window.sentAt = [];
   window.moving = setInterval(() => {
@@ -69,17 +66,6 @@ nodes:
 """
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip("chromium is not here (apt-get install chromium)")
-    with sync_playwright() as playwright:
-        arguments = ["--no-sandbox", "--autoplay-policy=no-user-gesture-required"]
-        running = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield running
-        running.close()
-
-
 @pytest.fixture
 def page(browser: Browser) -> Iterator[Page]:
     opened = browser.new_page(viewport={"width": 390, "height": 844})
@@ -92,14 +78,6 @@ def page(browser: Browser) -> Iterator[Page]:
     opened.close()
     assert problems == []
     assert {re.match(r"http://127\.0\.0\.1:\d+/", url) is not None or url == "data:," for url in asked} <= {True}
-
-
-def until(condition: Callable[[], Any]) -> Any:
-    deadline = time.monotonic() + DEADLINE
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "waited for in vain"
-        time.sleep(0.02)
-    return found
 
 
 def served(**how: bool) -> Any:
@@ -239,6 +217,11 @@ def test_what_is_no_reading_is_counted_and_named() -> None:
     assert driver.taken({"readings": [fast], "offset": 0.0}, 2_000_000_000) == []
     assert driver.taken({"readings": [later], "offset": 0.0, "delay": 50.0}, 2_000_000_000) == []  # clocks
     assert sum(driver.refused.values()) == 5
+    wilder = [{"t": 1300.0, "rate": [number, 0, 0]} for number in range(10**9, 10**9 + 50)]
+    causes = set(driver.refused)
+    assert driver.taken({"readings": wilder, "offset": 0.0}, 2_000_000_000) == []
+    assert sum(driver.refused.values()) == 55
+    assert set(driver.refused) == causes, "a phone that finds ever new values does not fill the memory"
 
 
 def test_a_silent_phone_says_how_far_time_has_come() -> None:

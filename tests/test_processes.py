@@ -659,6 +659,39 @@ def test_a_live_run_goes_on_without_what_lags_and_its_recording_knows(
     assert "samples equal in every byte" in done.stdout
 
 
+WRITES = """
+from pathlib import Path
+from caneflow.runtime import Sink
+from caneflow.runtime.node import run
+
+class Writes(Sink):
+    def __init__(self, settings, context):
+        Path(__file__).with_suffix(".txt").open("x").close()
+
+    def take(self, key, message, payload, time): ...
+    def idle(self, time): ...
+    def finish(self): ...
+
+if __name__ == "__main__":
+    run(Writes)
+"""
+
+
+def test_verify_writes_nothing(cane: Path, walk: Path, tmp_path: Path) -> None:
+    """A sink of the graph has no output to compare, and what it wrote in the run is not written again."""
+    (tmp_path / "writes.py").write_text(WRITES)
+    cane.write_text(
+        cane.read_text().replace("nodes:\n", "nodes:\n  writes: {run: ./writes.py, inputs: {pose: fusion/pose}}\n")
+    )
+    out, written = tmp_path / "out.mcap", tmp_path / "writes.txt"
+    done = caneflow("run", cane, "--replay", walk, "--in-process", "--record", out)
+    assert done.returncode == 0, done.stderr
+    written.unlink()
+    done = caneflow("verify", cane, out)
+    assert done.returncode == 0, done.stderr
+    assert not written.exists()
+
+
 def test_verify_names_the_first_difference(cane: Path, walk: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     done = caneflow("run", cane, "--replay", walk, "--in-process", "--record", out)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from caneflow.algorithms.surroundings.sonification import RATE
+from caneflow.errors import CaneflowError
 from caneflow.messages import Cue, encode, numbered, sample_key
 from caneflow.messages.rig import Rig, read_rig
 from caneflow.recording import RecordingWriter
@@ -103,6 +104,18 @@ def test_what_an_earlier_run_has_left_is_not_taken_over(tmp_path: Path) -> None:
         assert file.getnframes() == pytest.approx(1.5 * RATE, abs=RATE / 10)
 
 
+def test_a_file_that_exists_is_kept_but_by_who_takes_over(tmp_path: Path) -> None:
+    file = tmp_path / "kept.wav"
+    file.write_bytes(b"a year's work")
+    with pytest.raises(CaneflowError, match="already exists"):
+        sound(file)
+    assert file.read_bytes() == b"a year's work"
+    assert [each.name for each in tmp_path.iterdir()] == ["kept.wav"]
+    sound(file, takes_over=True).finish()  # killed between the file and its end
+    with wave.open(str(file)) as written:
+        assert written.getframerate() == RATE
+
+
 def test_a_folder_that_is_not_there_is_told_in_a_line(tmp_path: Path) -> None:
     with pytest.raises(DataflowError, match="cannot be written: No such file"):
         CueLog(tmp_path / "no" / "a.wav.cues", goes_on=False)
@@ -125,6 +138,9 @@ def test_processes_a_kill_and_one_process_give_the_same_bytes(tmp_path: Path) ->
         wait_for(lambda: log.exists() and log.stat().st_size > 2000, "some cues")
         node_processes(many.process.pid)["sound"].send_signal(signal.SIGKILL)
         assert many.ends() == 0, many.said
+        again = launch("run", tmp_path / "one.yaml", "--replay", recording, "--in-process", log=tmp_path / "again.log")
+        assert again.ends() == 2, again.said
+        assert "one.wav: already exists" in again.said
     assert (tmp_path / "many.wav").read_bytes() == (tmp_path / "one.wav").read_bytes()
 
 

@@ -2,11 +2,9 @@
 
 import math
 import re
-import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,14 +18,12 @@ from caneflow.recording import RecordingWriter
 from caneflow.runtime.hosts.attached.attach import ANY, Heard, attached
 from caneflow.viewing.columns import row_of
 from caneflow.viewing.live import LiveStreams
+from tests.browser import DEADLINE, running_browser, until  # noqa: F401 - the fixture `browser`
 
-pytest.importorskip("playwright", reason="playwright is not installed here (pip install 'caneflow[dev]')")
 server = pytest.importorskip("caneflow.viewing.server", reason="the extra `view` is not installed here")
-from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Browser, Page, expect  # noqa: E402
 
-CHROMIUM = shutil.which("chromium")
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
-DEADLINE = 30.0  # s for anything that is waited for
 BORESIGHT = (0.0, 1.0, 0.0)
 MINUS = "\N{MINUS SIGN}"
 AA = 4.5  # contrast of text
@@ -77,16 +73,6 @@ nodes:
 """
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip("chromium is not here (apt-get install chromium)")
-    with sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield running
-        running.close()
-
-
 @pytest.fixture
 def page(browser: Browser) -> Iterator[Page]:
     opened = browser.new_page(viewport={"width": 1280, "height": 900})
@@ -97,15 +83,6 @@ def page(browser: Browser) -> Iterator[Page]:
     yield opened
     opened.close()
     assert [each for each in problems if "WebSocket" not in each] == []
-
-
-def until(condition: Callable[[], Any]) -> Any:
-    """What `condition` gives as soon as that is true."""
-    deadline = time.monotonic() + DEADLINE
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "waited for in vain"
-        time.sleep(0.02)
-    return found
 
 
 def pose(seq: int, sd: float = 0.1) -> Pose:

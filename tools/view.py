@@ -28,6 +28,7 @@ from caneflow.runtime.hosts.attached.flow_events import Began, Came, Ended, Told
 from caneflow.runtime.node import run
 from caneflow.runtime.site import DEFAULT_KEYS
 from caneflow.viewing.live import LiveStreams
+from caneflow.viewing.phone_page import PhonePageSettings, page_server, squares_of
 from caneflow.viewing.recorded import RecordedStreams
 
 if TYPE_CHECKING:
@@ -73,19 +74,15 @@ def command(
 
 def _serve_phone(flow: str | None, at: str | None, keys: Path, listen: str, port: int) -> None:
     """Tell a phone the cues of a running flow, until it ends."""
-    try:
-        from caneflow.viewing.phone_server import PhoneServer, certificate_in, in_squares
-    except ModuleNotFoundError as error:
-        raise CaneflowError(not_installed(str(error.name), "phone")) from error
     from caneflow.runtime.hosts.attached.followed import followed  # here, as it takes Zenoh: a recording does not
 
     with contextlib.closing(followed(flow, at, keys)) as events:
         began = next(events)
         assert isinstance(began, Began)
         guidance = (read_rig(began.status.rig).user or User()).guidance
-        tls = certificate_in(keys)
-        with PhoneServer(guidance, hears=True, senses=False, listen=listen, port=port, tls=tls) as server:
-            print(f"{in_squares(server.address)}{server.address}  (Ctrl-C ends it)", flush=True)
+        settings = PhonePageSettings(listen=listen, port=port, keys=str(keys))
+        with page_server(settings, guidance, hears=True, senses=False) as server:
+            print(*squares_of(server), f"{server.address}  (Ctrl-C ends it)", sep="\n", flush=True)
             for event in events:  # a flow that has ended is told as blind: no cue comes
                 if isinstance(event, Came) and event.kind is Cue:
                     with contextlib.suppress(MessageError):

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from contextlib import suppress
 
 from caneflow.runtime.errors import DataflowError
 
@@ -26,11 +27,9 @@ class Speech:
             self._command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         assert self._speaking.stdin is not None
-        try:
+        with suppress(OSError):  # it ended at once: nothing is said, and the next text is tried
             self._speaking.stdin.write(text.encode())
             self._speaking.stdin.close()
-        except OSError:  # it ended at once: nothing is said, and the next text is tried
-            pass
 
     def close(self) -> None:
         """Be silent."""

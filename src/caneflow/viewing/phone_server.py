@@ -8,12 +8,9 @@ import asyncio
 import io
 import queue
 import secrets
-import socket
 import ssl
-import threading
 import time
 from contextlib import suppress
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +18,7 @@ import msgspec
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -29,14 +26,11 @@ from caneflow.algorithms.surroundings.cue_texts import CueTexts
 from caneflow.errors import CaneflowError
 from caneflow.messages import Cue
 from caneflow.messages.rig import Guidance
-from caneflow.viewing.server import HEADERS, TYPES
+from caneflow.viewing.serving import FORBIDDEN, HEADERS, LOOPBACK, ServerThread, file_of, is_of_this_page, listening_on
 
 BEAT = 0.2  # s between two signs of life for the page
 MOST_BYTES = 16_384  # of what a page sends at once
-MOST_WAITING = 2_000  # readings that this process may be behind
-FORBIDDEN = 4403  # close code of a websocket without the key
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-STOP_PATIENCE = 2.0  # s
+MOST_WAITING = 100  # messages of pages that this process may be behind: seconds, and 100 MB of the worst ones
 
 
 class Certificate(NamedTuple):
@@ -59,7 +53,7 @@ class Readings(NamedTuple):
     said: dict[str, Any]
 
 
-class PhoneServer:
+class PhoneServer(ServerThread):
     """The page's server, on a thread of its own; a context manager."""
 
     def __init__(
@@ -75,16 +69,16 @@ class PhoneServer:
                 f"`caneflow keys add page --address {listen}` makes its certificate"
             )
         self.readings: queue.Queue[Readings] = queue.Queue(MOST_WAITING)
-        self.unheard = 0  # readings that this process was too slow for
+        self.unheard = 0  # messages that this process was too slow for
         self._hello = {"hears": hears, "senses": senses, "guidance": guidance.model_dump()}
         self._texts = CueTexts(guidance.range, frozenset(guidance.levels))
         self._cue: dict[str, Any] | None = None
         self._clients: set[asyncio.Queue[dict[str, Any]]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._key = secrets.token_urlsafe(18)
-        self._socket = _listening(listen, port)
+        listening = listening_on(listen, port, "expected a free port of this machine")
         scheme = "https" if tls else "http"
-        self.address = f"{scheme}://{listen}:{self._socket.getsockname()[1]}/#{self._key}"
+        self.address = f"{scheme}://{listen}:{listening.getsockname()[1]}/#{self._key}"
         routes = [Route("/", self._file), Route("/{name}", self._file), WebSocketRoute("/phone", self._phone)]
         config = uvicorn.Config(
             Starlette(routes=routes), log_level="warning", ws="wsproto", ws_max_size=MOST_BYTES, access_log=False,
@@ -94,23 +88,11 @@ class PhoneServer:
         try:
             config.load()
         except (OSError, ssl.SSLError) as error:
-            self._socket.close()
+            listening.close()
             raise CaneflowError(
                 f"{tls.certificate if tls else listen}: not a certificate with its key: {error}"
             ) from error
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": [self._socket]}, name="phone", daemon=True
-        )
-
-    def __enter__(self) -> "PhoneServer":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.should_exit = True
-        self._thread.join(STOP_PATIENCE)
-        self._socket.close()
+        super().__init__(config, listening, name="phone")
 
     def tell(self, cue: Cue) -> None:
         """Let the phones hear a cue; from any thread."""
@@ -131,15 +113,12 @@ class PhoneServer:
                 client.put_nowait(message)
 
     async def _file(self, request: Request) -> Response:
-        name = request.path_params.get("name", "index.html")
-        kind = TYPES.get(name.rpartition(".")[2])
-        page = {file.name: file for file in files("caneflow.viewing").joinpath("phone").iterdir()}
-        if kind is None or name not in page:
-            return PlainTextResponse("not here\n", status_code=404)
-        return Response(page[name].read_bytes(), media_type=kind, headers=HEADERS)
+        response = file_of("phone", request)
+        response.headers.update(HEADERS)
+        return response
 
     async def _phone(self, websocket: WebSocket) -> None:
-        if not self._is_of_this_page(websocket):
+        if not is_of_this_page(websocket, self._key):
             await websocket.close(FORBIDDEN)
             return
         await websocket.accept()
@@ -157,11 +136,6 @@ class PhoneServer:
             sending.cancel()
             with suppress(asyncio.CancelledError):
                 await sending
-
-    def _is_of_this_page(self, websocket: WebSocket) -> bool:
-        key = websocket.query_params.get("key", "")
-        origin = websocket.headers.get("origin", "").partition("//")[2]
-        return secrets.compare_digest(key.encode(), self._key.encode()) and origin == websocket.headers.get("host")
 
     async def _hear(self, websocket: WebSocket, client: asyncio.Queue[dict[str, Any]]) -> None:
         with suppress(WebSocketDisconnect):
@@ -200,17 +174,3 @@ def in_squares(address: str) -> str:
     drawn = io.StringIO()
     segno.make(address, error="m").terminal(drawn, compact=True)
     return drawn.getvalue()
-
-
-def _listening(address: str, port: int) -> socket.socket:
-    listening = socket.socket()
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind((address, port))
-        listening.listen()
-    except OSError as error:
-        listening.close()
-        raise CaneflowError(
-            f"port {port} on {address}: {error.strerror}; expected a free port of this machine"
-        ) from error
-    return listening

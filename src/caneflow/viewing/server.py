@@ -6,14 +6,10 @@ a Host that is this machine (against DNS rebinding), and an Origin that is this 
 
 import asyncio
 import secrets
-import socket
-import threading
 from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from importlib.resources import files
 from typing import Any, Protocol
-from urllib.parse import SplitResult, urlsplit
 
 import msgspec
 import uvicorn
@@ -25,27 +21,21 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from caneflow.errors import CaneflowError
 from caneflow.viewing.packets import packet
+from caneflow.viewing.serving import (
+    FORBIDDEN,
+    HEADERS,
+    LOOPBACK,
+    ServerThread,
+    file_of,
+    is_of_this_page,
+    listening_on,
+    split_address,
+)
 
 BEAT = 0.03  # s between two batches
 MOST_WAITING = 33  # batches for one page: 1 s; beyond, the oldest are left out and counted
 MOST_ASKED = 4_096  # bytes of a page's request
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-FORBIDDEN = 4403  # close code of a websocket without the key
-STOP_PATIENCE = 2.0  # s
-HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Cache-Control": "no-store",
-}
-TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 
 
 class Feed(Protocol):
@@ -108,7 +98,7 @@ class _Client:
         return self._waiting.popleft()
 
 
-class PageServer:
+class PageServer(ServerThread):
     """The page's server, on a thread of its own; a context manager."""
 
     def __init__(self, feed: Feed, *, port: int = 0) -> None:
@@ -117,26 +107,14 @@ class PageServer:
         self._clients: set[_Client] = set()
         self._key = secrets.token_urlsafe(18)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._socket = _listen(port)
-        self.port: int = self._socket.getsockname()[1]
+        listening = listening_on("127.0.0.1", port, "give another with --port, or 0")
+        self.port: int = listening.getsockname()[1]
         self.address = f"http://127.0.0.1:{self.port}/#{self._key}"
         config = uvicorn.Config(
             _OnlyHere(self._application()), log_level="warning", ws="wsproto", ws_max_size=MOST_ASKED, access_log=False,
             ws_per_message_deflate=False, timeout_graceful_shutdown=1, lifespan="on",
         )  # fmt: skip
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page", daemon=True
-        )
-
-    def __enter__(self) -> "PageServer":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.should_exit = True
-        self._thread.join(STOP_PATIENCE)
-        self._socket.close()
+        super().__init__(config, listening, name="page")
 
     def show(self, feed: Feed) -> None:
         """Show another feed from now on, on the pages that are open as well; from any thread."""
@@ -184,16 +162,10 @@ class PageServer:
                 client.offer(batch)
 
     async def _file(self, request: Request) -> Response:
-        name = request.path_params.get("name", "index.html")
-        kind = TYPES.get(name.rpartition(".")[2])
-        # A stranger's name is compared with those that there are, and never given to the file system.
-        page = {file.name: file for file in files("caneflow.viewing").joinpath("page").iterdir()}
-        if kind is None or name not in page:
-            return PlainTextResponse("not here\n", status_code=404)
-        return Response(page[name].read_bytes(), media_type=kind)
+        return file_of("page", request)
 
     async def _samples(self, websocket: WebSocket) -> None:
-        if not self._is_of_this_page(websocket):
+        if not is_of_this_page(websocket, self._key):
             await websocket.close(FORBIDDEN)
             return
         await websocket.accept()
@@ -208,11 +180,6 @@ class PageServer:
             sending.cancel()
             with suppress(asyncio.CancelledError):
                 await sending
-
-    def _is_of_this_page(self, websocket: WebSocket) -> bool:
-        key = websocket.query_params.get("key", "")
-        origin = _split(websocket.headers.get("origin", ""))
-        return secrets.compare_digest(key.encode(), self._key.encode()) and origin.netloc == websocket.headers["host"]
 
     async def _answer(self, websocket: WebSocket, client: _Client) -> None:
         """Answer the page's requests until it is closed."""
@@ -243,7 +210,7 @@ class _OnlyHere:
         if scope["type"] == "lifespan":
             await self._application(scope, receive, send)
             return
-        host = _split(f"//{Headers(scope=scope).get('host', '')}").hostname
+        host = split_address(f"//{Headers(scope=scope).get('host', '')}").hostname
         if host not in LOOPBACK:
             if scope["type"] == "http":
                 await PlainTextResponse("this page is for this machine only\n", status_code=403)(scope, receive, send)
@@ -257,23 +224,3 @@ class _OnlyHere:
             await send(message)
 
         await self._application(scope, receive, fenced)
-
-
-def _split(address: str) -> SplitResult:
-    """The parts of an address that a stranger names; all are empty when it is none."""
-    try:
-        return urlsplit(address)
-    except ValueError:  # e.g. an unclosed bracket
-        return urlsplit("")
-
-
-def _listen(port: int) -> socket.socket:
-    listening = socket.socket()
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind(("127.0.0.1", port))
-        listening.listen()  # who comes before the server has started waits
-    except OSError as error:
-        listening.close()
-        raise CaneflowError(f"port {port} on 127.0.0.1: {error.strerror}; give another with --port, or 0") from error
-    return listening

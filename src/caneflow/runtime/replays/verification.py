@@ -104,9 +104,9 @@ def verify(graph: Graph, path: Path, *, tolerance: float | None = None) -> Verif
             for (node, port), out in outputs.items()
         }
         observer = NodePlan(flow=graph.flow, node=COMPARISON, inputs=inputs, replay=True)
-        watched = Deployment(
-            flow=deployment.flow, plans={**deployment.plans, COMPARISON: observer}, origin=deployment.origin
-        )
+        # Without the graph's own sinks: they have no outputs to compare, and write files or serve pages.
+        compared = {name: plan for name, plan in deployment.plans.items() if plan.outputs}
+        watched = Deployment(flow=deployment.flow, plans={**compared, COMPARISON: observer}, origin=deployment.origin)
         programs: dict[str, Program] = {n: node.program for n, node in graph.nodes.items() if node.program}
         InProcess(watched, {**programs, COMPARISON: comparison.as_program()}).run()
         return Verification(verdicts=comparison.verdicts(), tolerance=tolerance, differences=differences)

@@ -16,7 +16,7 @@ from caneflow.runtime.hosts.launcher.watcher import Say
 from caneflow.runtime.outcome import Outcome
 from caneflow.runtime.plan import NodePlan
 
-STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them: 5 s in all
+STOP_PATIENCE = 2.5  # s that nodes have to end, and then as long for the sinks behind them
 SOURCES_PATIENCE = 1.5  # s before that for the sources of groups that end later
 RECORDER_PATIENCE = 10.0  # s that recorders have, behind all others: who kills one loses the end of its recording
 
