@@ -264,3 +264,11 @@ def test_a_grid_is_drawn_where_its_cells_are(tmp_path: Path) -> None:
     assert picture.floor_missing is not None
     np.testing.assert_allclose(picture.occupied, [[2.05, 0.45]])
     np.testing.assert_allclose(picture.floor_missing, [[2.25, -0.15]])
+
+
+def test_tracks_have_their_colours_by_name_whichever_came_first(tmp_path: Path) -> None:
+    samples: list[tuple[str, Sample]] = []
+    for node in ("paper", "other", "fusion"):
+        samples += [(f"cane/{node}/pose", pose(PERIOD * i, 0.1 * i, 0.0, 0.0, "kalman")) for i in range(3)]
+    picture = read_picture(write(tmp_path / "track.mcap", samples))
+    assert list(picture.tracks) == ["fusion/pose kalman", "other/pose kalman", "paper/pose kalman"]

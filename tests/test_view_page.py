@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -217,6 +218,8 @@ def test_a_recording_is_scrubbed_to_the_very_sample(page: Page, tmp_path: Path) 
         assert viewing.stdout is not None
         page.goto(viewing.stdout.readline().split()[0])
         until(lambda: page.evaluate("window.caneflow?.state.series.get('fusion/pose')?.length === 500"))
+        until(lambda: page.inner_text("#at-x") == "4.99 m")  # it opens at the end
+        assert page.inner_text("#words").startswith("At 10 s: 11.2 metres from the start")
         page.locator("#cursor").fill("4.36")
         until(lambda: page.inner_text("#at-x") == "2.18 m")  # sample 218
         assert page.inner_text("#at-y") == f"{MINUS}4.36 m"
@@ -264,6 +267,32 @@ def remember_plan(page: Page) -> None:
       window.changed = () =>
         pixels().reduce((sum, value, i) => sum + (Math.abs(value - before[i]) > 30), 0) / before.length;
     }""")
+
+
+def test_the_track_that_knows_how_sure_it_is_is_the_one_that_is_told(page: Page) -> None:
+    streams = LiveStreams(flow="cane", rig=Rig())
+    with server.PageServer(streams) as serving:
+        for seq in range(3):
+            unsure = msgspec.structs.replace(pose(seq), covariance=None, position=(9.0, 9.0, 0.0))
+            streams.take("a/pose", unsure, unsure.stamp)
+            streams.take("fusion/pose", pose(seq), pose(seq).stamp)
+        page.goto(serving.address)
+        until(lambda: page.input_value("#primary") == "fusion/pose")
+        until(lambda: page.inner_text("#at-x") == "0.02 m")
+        page.select_option("#primary", "a/pose")
+        until(lambda: page.inner_text("#at-x") == "9.00 m")
+        assert "Its uncertainty is not known." in page.inner_text("#words")
+
+
+def test_on_a_small_screen_the_whole_plan_stands_above_the_time_bar(shown: tuple[Page, LiveStreams]) -> None:
+    page, _ = shown
+    page.set_viewport_size({"width": 800, "height": 600})
+    bar = page.locator("footer").bounding_box()
+    plan = page.locator("#plan").bounding_box()
+    assert bar is not None
+    assert plan is not None
+    assert plan["height"] >= 200
+    assert plan["y"] + plan["height"] <= bar["y"]
 
 
 def test_a_track_that_was_drawn_bit_by_bit_looks_like_one_drawn_at_once(shown: tuple[Page, LiveStreams]) -> None:
@@ -396,23 +425,25 @@ def test_what_is_shown_has_roles_and_names(shown: tuple[Page, LiveStreams]) -> N
         .filter((id) => id && !document.getElementById(id))""")  # fmt: skip
     assert described == []
     assert page.get_attribute("html", "lang") == "en"
-    assert page.get_attribute("#words", "aria-live") == "polite"
+    assert page.get_attribute("#said", "aria-live") == "polite"
 
 
-def test_the_position_is_said_at_a_calm_rate(shown: tuple[Page, LiveStreams]) -> None:
+def test_the_position_is_said_at_a_calm_rate_and_shown_at_once(shown: tuple[Page, LiveStreams]) -> None:
     page, streams = shown
     page.evaluate("""() => {
       window.said = 0;
-      const words = document.getElementById("words");
-      new MutationObserver(() => { window.said += 1; }).observe(words, { childList: true });
+      const said = document.getElementById("said");
+      new MutationObserver(() => { window.said += 1; }).observe(said, { childList: true });
     }""")
     for seq in range(100, 160):
         walk(streams, seq)
         until(partial(has_come, page, seq))
+    until(lambda: page.inner_text("#words").startswith("At 3 s: 3.6 metres from"))
     assert page.evaluate("window.said") <= 1
     page.select_option("#calm", "0")
     walk(streams, 160)
-    until(lambda: page.get_attribute("#words", "aria-live") == "off")
+    until(partial(has_come, page, 160))
+    assert page.evaluate("window.said") <= 1
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])

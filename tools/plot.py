@@ -1,6 +1,6 @@
 """`caneflow plot`: a recording as a picture: the track, its speed and errors, or what a single sensor shows."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -177,7 +177,7 @@ def _errors_of_a_walk(track: Track, truth: Track, picture: Picture) -> str:
 def read_picture(path: Path) -> Picture:
     """What there is to draw in the recording at `path`; raises RecordingError when there is nothing."""
     with Recording(path) as recording:
-        poses = [stream for stream in recording.streams_of(Pose) if stream.count > 1][:MOST_TRACKS]
+        poses = _by_name(stream for stream in recording.streams_of(Pose) if stream.count > 1)
         truth = recording.streams.get(TRUTH)
         truth = truth if truth and truth.count > 1 else None
         span = recording.span()
@@ -196,7 +196,7 @@ def read_picture(path: Path) -> Picture:
         if truth:
             picture.truth, velocities, _ = _track(recording, truth)
             picture.truth_speed = None if picture.sensors else _along_boresight(picture, velocities)
-        for stream in recording.streams_of(GroundSpeed)[:MOST_TRACKS]:
+        for stream in _by_name(recording.streams_of(GroundSpeed)):
             picture.speeds[f"{stream.node}/{stream.port}"] = _speeds(recording, stream, span[0])
         for stream in recording.streams_of(Grid)[:1] if poses else ():
             picture.occupied, picture.floor_missing = _grid_cells(recording, stream)
@@ -209,6 +209,11 @@ def read_picture(path: Path) -> Picture:
             f"{path}: nothing to draw; expected 2 poses or IMU samples, 8 radar scans, or 0.3 s of a Doppler module"
         )
     return picture
+
+
+def _by_name(streams: Iterable[Stream]) -> list[Stream]:
+    """As many as can be told apart, each always in the same colour, whichever sample was recorded first."""
+    return sorted(streams, key=lambda stream: (stream.node, stream.port))[:MOST_TRACKS]
 
 
 def _add_single_sensors(picture: Picture, recording: Recording) -> None:

@@ -131,7 +131,7 @@ function takeHello(hello) {
   $("note").hidden = !hello.note;
   $("pace-label").hidden = !recorded;
   $("newest").textContent = recorded ? "End" : "Newest";
-  if (recorded) state.cursor = 0;
+  if (recorded) state.cursor = state.span; // the whole track
   connection("good", { live: "● live", replay: "● replay", recording: "■ recording" }[hello.source]);
   showPause();
 }
@@ -201,14 +201,22 @@ function first(type) {
 }
 
 function tracks() {
-  const poses = all("Pose").sort((a, b) => (a.name === "truth/pose" ? -1 : 0) - (b.name === "truth/pose" ? -1 : 0));
-  const primary = poses.find(({ name }) => name === state.primary) ?? poses.find(({ name }) => name !== "truth/pose") ?? poses[0];
+  const rank = (name) => (name === "truth/pose" ? "" : name); // not the order in which they came
+  const poses = all("Pose").sort((a, b) => (rank(a.name) < rank(b.name) ? -1 : 1));
+  const estimates = poses.filter(({ name }) => name !== "truth/pose");
+  const primary = poses.find(({ name }) => name === state.primary) ?? estimates.find(isSure) ?? estimates[0] ?? poses[0];
   const absolute = Object.keys(state.hello?.sensors ?? {}).length > 0;
   return poses.map((series) => {
     const truth = series.name === "truth/pose";
     const shift = truth && !absolute && primary && primary !== series ? between(series, primary) : [0, 0];
     return { series, truth, primary: series === primary, shift };
   });
+}
+
+// Whether a track has ever said how far off it may be: such a one is shown first.
+function isSure(series) {
+  series.sure ||= Number.isFinite(series.sample(series.length - 1)?.major);
+  return series.sure;
 }
 
 // From where a truth begins to where the estimate begins: a cane knows only its own start.
@@ -315,6 +323,7 @@ function drawInTurns() {
 function draw() {
   const found = tracks();
   const primary = found.find((track) => track.primary);
+  if (primary && $("primary").value !== primary.series.name) $("primary").value = primary.series.name;
   const pose = primary ? sampleAt(primary.series) : null;
   const stale = staleness(primary);
   const ground = first("GroundSpeed");
@@ -346,16 +355,14 @@ function showNumbers(pose, speed, primary, stale) {
   put("at-speed", speed ? (speed.valid ? `${number(speed.speed)} m/s` : "not valid") : pose ? `${number(Math.hypot(pose.vx, pose.vy))} m/s` : "–");
   put("at-quality", speed?.valid ? `±${number(speed.quality)} m/s` : "–");
   put("at-seq", primary && state.cursor === null && primary.series.lastSeq !== null ? String(primary.series.lastSeq) : pose ? `at ${number(pose.time)} s` : "–");
+  if (!primary || !pose) return;
+  const words = sentence(pose, primary.series, speed?.valid ? speed.speed : null, stale);
+  put("words", words);
   const calm = Number($("calm").value);
   const waited = performance.now() - lastSaid;
   const moved = state.cursor !== null && !state.playing && state.cursor !== state.saidAt; // by hand: soon
-  const due = lastSaid === 0 || waited > 1000 * (calm || 2) || (moved && waited > CALM_SCRUBBING);
-  if (primary && pose && due) say(pose, primary, speed, stale);
-  else if (moved) soon();
-}
-
-function showCalm() {
-  $("words").setAttribute("aria-live", Number($("calm").value) ? "polite" : "off");
+  if (calm && (lastSaid === 0 || waited > 1000 * calm || (moved && waited > CALM_SCRUBBING))) say(words);
+  else if (calm && moved) soon();
 }
 
 function soon() {
@@ -365,10 +372,11 @@ function soon() {
   }, CALM_SCRUBBING);
 }
 
-function say(pose, primary, speed, stale) {
+// To screen readers: the words are there at any time, and are spoken only now and then.
+function say(words) {
   lastSaid = performance.now();
   state.saidAt = state.cursor;
-  put("words", sentence(pose, primary.series, speed?.valid ? speed.speed : null, stale));
+  put("said", words);
 }
 
 function speedInWords(speed) {
@@ -565,12 +573,8 @@ function zoom(factor) {
 }
 
 function sayNow() {
-  const primary = tracks().find((track) => track.primary);
-  const pose = primary ? sampleAt(primary.series) : null;
-  const ground = first("GroundSpeed");
-  if (!pose) return;
-  put("words", ""); // so that the same words are said again
-  say(pose, primary, ground ? sampleAt(ground) : null, staleness(primary));
+  put("said", ""); // so that the same words are said again
+  say($("words").textContent);
 }
 
 function movePlan(key) {
@@ -637,7 +641,6 @@ $("primary").onchange = () => {
   lastSaid = 0;
   touch();
 };
-$("calm").onchange = showCalm;
 $("span").onchange = touch;
 $("theme").onchange = theme;
 dark.addEventListener("change", theme);
@@ -649,7 +652,6 @@ new ResizeObserver(() => {
 setInterval(showLatency, 1000);
 
 theme();
-showCalm();
 connect();
 setInterval(() => {
   if (state.hello && state.cursor === null && performance.now() - state.cameAt > 1000 * STALE) touch(); // it grows old

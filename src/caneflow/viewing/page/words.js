@@ -25,7 +25,7 @@ export function sentence(pose, series, speed, stale) {
   said.push(`At ${pose.time.toFixed(0)} s: ${away < 0.05 ? `at ${begin}` : `${metres(away)} from ${begin}`}, ${place}.`);
   said.push(
     !Number.isFinite(pose.major)
-      ? "How certain that is, is not known."
+      ? "Its uncertainty is not known."
       : isUnsure(pose)
         ? `This is uncertain, by ${metres(pose.major)}.`
         : `Probably within ${metres(pose.major)} of that.`,
