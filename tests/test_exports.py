@@ -163,6 +163,29 @@ def foxglove_of(path: Path) -> Found:
 READERS = {"rosbag2": bag_of, "foxglove": foxglove_of}
 
 
+def test_a_parquet_table_has_every_number_of_its_stream(
+    caneflow: Callable[..., Run], recording: Path, tmp_path: Path
+) -> None:
+    polars = pytest.importorskip("polars", reason="polars is not installed: pip install caneflow[parquet]")
+    tables = {}
+    for stream in ("imu/imu", "radar/frame", "fusion/pose"):
+        out = tmp_path / f"{stream.replace('/', '_')}.parquet"
+        done = caneflow("export", recording, "--format", "parquet", "--stream", stream, "-o", out)
+        assert done == (0, f"     100  {stream}\n", "")
+        tables[stream] = polars.read_parquet(out)
+    sent: dict[str, list[Sample]] = {stream: [] for stream in tables}
+    for stream, sample, _ in samples():
+        sent.get(stream, []).append(sample)
+    imu, frame, pose = tables.values()
+    assert imu["stamp"].to_list() == [sample.stamp for sample in sent["imu/imu"]]
+    assert imu["seq"].to_list() == list(range(100))
+    assert imu.row(0, named=True)["mag_2"] == -40.0
+    assert imu["accel_2"].to_list() == [9.75, None] * 50, "null: every second sample has no acceleration"
+    scans = frame["scans_re"].to_numpy() + 1j * frame["scans_im"].to_numpy()
+    assert np.array_equal(scans, np.concatenate([sample.scans for sample in sent["radar/frame"]]))  # type: ignore[attr-defined]
+    assert np.array_equal(pose["covariance"][7].to_numpy(), np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
+
+
 @pytest.mark.parametrize("form", READERS)
 def test_ros_messages_come_out_as_they_went_in(
     caneflow: Callable[..., Run], recording: Path, tmp_path: Path, form: str
@@ -301,11 +324,12 @@ def test_frames_can_be_named(caneflow: Callable[..., Run], recording: Path, tmp_
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (["parquet", "--stream", "imu/imu"], "--format parquet: needs -o, the file to write"),
         (["foxglove"], "--format foxglove: needs -o, the file to write"),
         (["rosbag2"], "--format rosbag2: needs -o, the folder to write"),
         (
             ["rosbag2", "-o", "bag", "--stream", "imu/imu"],
-            "--format rosbag2: takes the whole recording; --stream is for tum and csv",
+            "--format rosbag2: takes the whole recording; --stream is for tum, csv and parquet",
         ),
         (["tum", "--world", "hall"], "--format tum: has no frames; --world and --tf are for foxglove and rosbag2"),
     ],
@@ -323,7 +347,12 @@ def test_the_recording_itself_is_kept(caneflow: Callable[..., Run], recording: P
 
 
 @pytest.mark.parametrize(
-    ("form", "package", "extra"), [("foxglove", "foxglove", "foxglove"), ("rosbag2", "rosbags.rosbag2", "rosbag2")]
+    ("form", "package", "extra"),
+    [
+        ("foxglove", "foxglove", "foxglove"),
+        ("rosbag2", "rosbags.rosbag2", "rosbag2"),
+        ("parquet --stream imu/imu", "polars", "parquet"),
+    ],
 )
 def test_a_library_that_is_missing_is_named(
     caneflow: Callable[..., Run],
@@ -335,7 +364,7 @@ def test_a_library_that_is_missing_is_named(
     extra: str,
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    status, _, err = caneflow("export", recording, "--format", form, "-o", tmp_path / "out")
+    status, _, err = caneflow("export", recording, "--format", *form.split(), "-o", tmp_path / "out")
     assert status == 2
     assert f"`pip install 'caneflow[{extra}]'` brings it" in err
 

@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from contextlib import nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from mcap.reader import make_reader
 from caneflow.messages import Imu, MessageError, Sample, decode, numbered, registry
 from caneflow.messages.arrays import to_bytes
 from caneflow.messages.rig import read_rig
-from caneflow.recording import Recorded, RecordingWriter
+from caneflow.recording import Recorded, Recording, RecordingWriter
+from caneflow.recording.export_parquet import export_parquet
 from caneflow.recording.untyped_rows import untyped_rows
 from caneflow.runtime.dataflow.loading import examine
 from caneflow.runtime.hosts.attached.attach import Heard
@@ -149,6 +151,11 @@ def test_who_does_not_know_the_type_shows_its_fields(project: Path) -> None:
         "0,0,2.5,front",
         f"{STEP},1,2.5,front",
     ]
+    with Recording(project / "out.mcap") as recording:
+        if find_spec("polars") is not None:
+            export_parquet(recording, recording.stream("ranger", "range"), project / "range.parquet")
+            rows = importlib.import_module("polars").read_parquet(project / "range.parquet")
+            assert rows.row(1) == (STEP, 1, 2.5, "front")
     schema = caneflow(project, "schema", "ranges.py:Range").stdout
     assert schema == caneflow(project, "schema", "out.mcap:mine.Range/1").stdout
     assert json.loads(schema) == recorded(project / "out.mcap")["own/ranger/range"][1]

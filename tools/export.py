@@ -28,13 +28,15 @@ class Format(StrEnum):
     CSV = "csv"
     FOXGLOVE = "foxglove"
     ROSBAG2 = "rosbag2"
+    PARQUET = "parquet"
 
 
 COVARIANCES = ".covariance.txt"  # in place of a tum file's suffix: the file beside it
 Shape: TypeAlias = tuple[int, ...]
 FIXED: dict[tuple[type[Sample], str], Shape] = {(Pose, "covariance"): (6, 6)}  # arrays that fit into a row
 
-TEXT = (Format.TUM, Format.CSV)  # one stream, readable; the others hold the whole recording
+TEXT = (Format.TUM, Format.CSV)  # readable, to standard output too
+ONE_STREAM = (*TEXT, Format.PARQUET)  # the others hold the whole recording
 
 
 def command(
@@ -45,6 +47,7 @@ def command(
             "--format",
             help="tum: a line per pose, `t x y z qx qy qz qw` in s and m, as evo reads it; covariances go to a file "
             "beside it. csv: a row per sample; stamp in ns, the rest in SI units and rad. "
+            "parquet: the same with arrays, for polars, pandas and DuckDB. "
             "foxglove: an MCAP file for Foxglove, Lichtblick, PlotJuggler and Rerun. rosbag2: a folder for ros2 bag. "
             "Both hold ROS 2 messages: Imu, MagneticField, Odometry, PoseStamped, PoseWithCovarianceStamped, "
             "TwistWithCovarianceStamped, tf, and the range-Doppler map as Image.",
@@ -58,7 +61,9 @@ def command(
     ] = None,
     stream: Annotated[
         str | None,
-        typer.Option(metavar="NODE/PORT", help="tum, csv: stream to write; by default the only one that fits."),
+        typer.Option(
+            metavar="NODE/PORT", help="tum, csv, parquet: stream to write; by default the only one that fits."
+        ),
     ] = None,
     world: Annotated[
         str | None,
@@ -70,17 +75,24 @@ def command(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write one stream of a recording as text (tum, csv), or all of it for other viewers (foxglove, rosbag2).
+    """Write one stream of a recording (tum, csv, parquet), or all of it for other viewers (foxglove, rosbag2).
 
     Example: caneflow export track.mcap --format tum -o track.tum
     """
-    if form not in TEXT:
+    if form not in ONE_STREAM:
         _export_whole(recording, form, output, stream, Naming(world, tf), overwrite=overwrite)
         return
     if world is not None or tf is not None:
         raise RecordingError(f"--format {form}: has no frames; --world and --tf are for foxglove and rosbag2")
+    if form not in TEXT and output is None:
+        raise RecordingError(f"--format {form}: needs -o, the file to write")
     with whole(output, inputs=[recording], overwrite=overwrite) as path, Recording(recording) as source:
         chosen = _chosen(source, form, stream)
+        if path is not None and form is Format.PARQUET:
+            from caneflow.recording.export_parquet import export_parquet  # here, as it brings its own library
+
+            print(f"{export_parquet(source, chosen, path):8d}  {chosen.node}/{chosen.port}")
+            return
         samples = source.samples([(chosen.node, chosen.port)])
         if form is Format.CSV:
             with _opened(path) as text:
@@ -120,7 +132,7 @@ def _export_whole(
             f"--format {form}: needs -o, the {'folder' if form is Format.ROSBAG2 else 'file'} to write"
         )
     if stream is not None:
-        raise RecordingError(f"--format {form}: takes the whole recording; --stream is for tum and csv")
+        raise RecordingError(f"--format {form}: takes the whole recording; --stream is for tum, csv and parquet")
     is_folder = form is Format.ROSBAG2
     with (
         whole(output, inputs=[recording], overwrite=overwrite, folder=is_folder) as path,
@@ -188,7 +200,9 @@ def _chosen(source: Recording, form: Format, stream: str | None) -> Stream:
             raise RecordingError(f"{source.path}: {stream} holds {chosen.schema}; tum takes {Pose.schema}")
         return chosen
     there = [
-        each for each in source.streams.values() if each.count and (form is Format.CSV or each.schema == Pose.schema)
+        each
+        for each in source.streams.values()
+        if each.count and (form is not Format.TUM or each.schema == Pose.schema)
     ]
     fitting = [each for each in there if (each.node, each.port) != TRUTH]
     if len(fitting) != 1:

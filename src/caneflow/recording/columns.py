@@ -45,6 +45,20 @@ def flat(rows: NDArray[np.void]) -> dict[str, NDArray[Any]]:
     return columns
 
 
+def arrays(rows: NDArray[np.void]) -> dict[str, NDArray[Any]]:
+    """The columns that `flat` leaves out, (n, ...); complex ones in two parts, `scans_re` and `scans_im`."""
+    columns: dict[str, NDArray[Any]] = {}
+    for name in rows.dtype.names or ():
+        column = rows[name]
+        if column.ndim == 1 or (column.ndim == 2 and column.shape[1] <= LONGEST_VECTOR):
+            continue
+        if np.iscomplexobj(column):
+            columns |= {f"{name}_re": column.real.copy(), f"{name}_im": column.imag.copy()}
+        else:
+            columns[name] = column.copy()
+    return columns
+
+
 LONGEST_VECTOR = 4  # elements: a quaternion; what is longer is an array
 
 

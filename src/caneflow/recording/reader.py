@@ -21,6 +21,7 @@ from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from numpy.typing import NDArray
 
+from caneflow.errors import not_installed
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.codec import fields_in
 from caneflow.messages.rig import Rig, overlaid, read_rig
@@ -222,7 +223,7 @@ class Recording:
         for library in ("polars", "pandas"):
             if find_spec(library) is not None:
                 return import_module(library).DataFrame(columns)
-        raise RecordingError("a data frame takes polars or pandas: pip install polars")
+        raise RecordingError(f"no pandas here, and {not_installed('polars', 'parquet')}")
 
     def examined(
         self,
