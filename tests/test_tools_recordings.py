@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from caneflow import command
 from caneflow.messages import GroundSpeed, Imu, Pose, RadarFrame, Sample, json_schema, numbered
-from caneflow.protocols.mrm import RadarConfig, build
+from caneflow.protocols.mrm import SCAN_INFO_BYTES, RadarConfig, build
 from caneflow.protocols.mrm_scans import Scan, split_scan
 from caneflow.recording import Recording, RecordingWriter
 from tools.import_recording import scan_period, stamps_of
@@ -223,6 +223,20 @@ def test_a_p440_log_becomes_a_recording(caneflow: Callable[..., Run], tmp_path: 
     assert (first.carrier, first.bandwidth, first.scan_period) == (4.07e9, 1.7e9, 0.01)
     assert first.range_step == pytest.approx(9.149e-3, abs=1e-6)  # m: 61.035 ps, both ways
     assert first.range_start == pytest.approx((23342 - 10000) * 1e-12 * 299792458 / 2)
+
+
+def test_lost_scans_are_said_in_the_last_line(caneflow: Callable[..., Run], tmp_path: Path) -> None:
+    log, path = tmp_path / "log.bin", tmp_path / "radar.mcap"
+    whole = radar_log([(7, 5000 + 10 * i, [i] * 400) for i in range(60)])
+    packets = [whole[at : at + SCAN_INFO_BYTES] for at in range(32, len(whole), SCAN_INFO_BYTES)]
+    log.write_bytes(b"".join(packets[:20] + packets[26:50] + packets[51:]))  # scans 10 to 12, and a packet of 25
+    status, out, _ = caneflow("import", "p440", log, "-o", path)
+    last = "56 scans of 400 samples, 100.00 Hz, 1 incomplete ones left out, 3 never came by their numbers"
+    assert (status, out.splitlines()[-1]) == (0, f"{path}: {last}"), "what never came is no fault of the log"
+    packets[30] = b"#" * SCAN_INFO_BYTES
+    log.write_bytes(b"".join(packets))
+    status, out, _ = caneflow("import", "p440", log, "-o", path, "--overwrite")
+    assert (status, out.splitlines()[-1].endswith("1 lost with 1452 damaged bytes")) == (1, True)
 
 
 def test_a_log_of_several_radars_is_imported_one_by_one(caneflow: Callable[..., Run], tmp_path: Path) -> None:

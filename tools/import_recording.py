@@ -15,7 +15,8 @@ from caneflow.messages import NAME, NAME_RULE, RadarFrame, numbered, sample_key
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
 from caneflow.protocols.errors import ProtocolError
-from caneflow.protocols.mrm_logs import Log, parse_log
+from caneflow.protocols.mrm_logs import parse_log
+from caneflow.protocols.mrm_salvage import Log, missing_scans
 from caneflow.protocols.mrm_scans import Scan, milliseconds_after
 from caneflow.recording import RecordingWriter
 
@@ -53,8 +54,9 @@ def p440(
 ) -> None:
     """Make a recording of a P440's log: MRM_SCAN_INFO packets as they came by UDP, or the vendor's lines of text.
 
-    Stamps are the radar's own time, 0 at the first scan. Scans that lack a packet are left out, and counted. What is
-    damaged is left out and named; the status is 1 when more than 1 % of the scans are lost with it.
+    Stamps are the radar's own time, 0 at the first scan. Scans that lack a packet are left out, and counted, as are
+    those that never came into the log, by the numbers of their neighbours. What is damaged is left out and named; the
+    status is 1 when more than 1 % of the scans are lost with it.
 
     Example: caneflow import p440 scan_2105627.txt -o rail.mcap
     """
@@ -82,7 +84,8 @@ def p440(
     if parsed.damage:
         first = parsed.damage[0]
         print(f"{log}: damaged in {len(parsed.damage)} places, first at {first.place}: {first.reason}")
-    print(f"{output}: {len(scans)} scans of {len(scans[0].samples)} samples, {1 / period:.2f} Hz, {_losses(parsed)}")
+    found = f"{len(scans)} scans of {len(scans[0].samples)} samples, {1 / period:.2f} Hz"
+    print(f"{output}: {found}, {_losses(parsed, scans)}")
     if parsed.damaged_scans > MOST_LOST * (len(parsed.scans) + parsed.damaged_scans):
         raise typer.Exit(1)
 
@@ -161,9 +164,14 @@ def _scans_of_one_radar(log: Path, parsed: Log, source_id: int | None) -> list[S
     return scans
 
 
-def _losses(parsed: Log) -> str:
+def _losses(parsed: Log, scans: Sequence[Scan]) -> str:
     counts = parsed.counts
     parts = [f"{counts.incomplete_scans} incomplete ones left out"]
+    never_came = missing_scans(scans) - counts.incomplete_scans - parsed.damaged_scans
+    if never_came > 0:
+        parts.append(f"{never_came} never came by their numbers")
+    if counts.duplicate_packets:
+        parts.append(f"{counts.duplicate_packets} packets came twice")
     if counts.restarts:
         parts.append(f"{counts.restarts} restarts of the radar's clock")
     if parsed.damage:
