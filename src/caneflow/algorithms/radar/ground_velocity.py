@@ -32,6 +32,7 @@ from caneflow.algorithms.quantities import (
     TurnRate,
     Zero,
 )
+from caneflow.algorithms.radar.effective_range import EffectiveRanges
 from caneflow.algorithms.radar.footprint import CaneGeometry, antenna_height, pitch
 from caneflow.algorithms.radar.matched_velocity import Doubts, lag_sums, matched_speed
 from caneflow.algorithms.radar.moving_returns import MovingReturns
@@ -60,6 +61,8 @@ class GroundVelocitySettings:
     window: Annotated[float, Ge(1e-3), Le(2)] = 0.05  # s of pairs of scans in a sum
     every: Annotated[float, Ge(0), Le(2)] = 0.05  # s from one estimate to the next: windows that overlap err alike
     cell: Length = 0.075  # m of range in a sum: the pulse is 0.09 m long
+    # rms length of the pulse's power over c / 2 bandwidth: a Gaussian cut off at -10 dB, 3.65 cm of range at 1.7 GHz
+    pulse_spread: Factor | Zero = 0.414
     shallowest: Elevation = math.radians(16)  # rad, grazing angle
     steepest: Elevation = math.radians(75)  # rad
     beam_share: Factor = 0.7  # of the aperture, to either side of the boresight, that is looked at
@@ -138,6 +141,7 @@ class GroundVelocityEstimator:
         self._geometry = geometry
         self._pairs = 2  # of scans in a window
         self._window = PulsePairWindow(window=self._pairs, cell=settings.cell)
+        self._ranges = EffectiveRanges(settings.pulse_spread)
         self._last_ns: int | None = None  # when an estimate was due last
         self._heave = HeaveObserver(settings.heave)
         self._heaves: deque[tuple[int, float, float]] = deque(maxlen=_HEAVES)  # stamp, height, rate
@@ -174,9 +178,13 @@ class GroundVelocityEstimator:
         if returns.restarted:
             self._begin(returns)
         self._window.push(returns)
+        if returns.restarted:
+            self._ranges.start(returns.scans.shape[1], self._window.cell_bins, returns.parameters)
         elapsed = self._due(returns)
         if elapsed is None:
             return None
+        if self._pairs < MANY_PAIRS:
+            self._ranges.learn(returns.scans[-1], elapsed)
         interval = self._window.interval_ns()
         if interval is None:
             return _nothing(0.5 * self._pairs * returns.parameters.scan_period)
@@ -274,13 +282,18 @@ class GroundVelocityEstimator:
 
     def _lit(self, height: float, axis: float, per_speed: float) -> _Cells | None:
         """The cells that the beam lights, with the derivatives of their phase; None when there are too few."""
+        settings = self._settings
         between = self._lit_ranges(height, axis)
         if between is None:
             return None
         sums = self._window.sums(*between)
-        if len(sums.ranges) < self._settings.fewest_cells:
+        if len(sums.ranges) < settings.fewest_cells:
             return None
-        along, sine, per_height = self._slopes(sums.ranges, height, axis, per_speed)
+        ranges = sums.ranges
+        if settings.pulse_spread:
+            ranges = self._ranges.of_cells(sums.first, len(ranges))
+            np.maximum(ranges, between[0], out=ranges)  # nothing is lit more steeply
+        along, sine, per_height = self._slopes(ranges, height, axis, per_speed)
         return _Cells(
             pairs=sums.pairs,
             power=sums.power,

@@ -60,6 +60,11 @@ class PulsePairWindow:
         self._range_list: list[float] = []  # the same
         self._scans = SlowTimeWindow(length=window + lag, bins=0)
 
+    @property
+    def cell_bins(self) -> int:
+        """How many range bins are in a cell."""
+        return self._bins
+
     def push(self, returns: MovingReturns) -> None:
         """Take the scans of one more frame."""
         if returns.restarted:
