@@ -12,7 +12,21 @@ import caneflow
 project = "caneflow"
 author = "the caneflow authors"
 version = release = caneflow.__version__
-extensions = ["myst_parser", "sphinx_copybutton", "equations"]
+extensions = ["myst_parser", "sphinx_copybutton", "equations", "sphinx_gallery.gen_gallery"]
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples/notebooks",
+    "gallery_dirs": "notebooks",
+    "filename_pattern": r"\.py",  # each is run
+    "abort_on_example_error": True,
+    "within_subsection_order": "FileNameSortKey",
+    "copyfile_regex": r".*\.md",
+    "nested_sections": False,
+    "remove_config_comments": True,
+    "capture_repr": (),  # only what is printed
+    "show_memory": False,
+    "write_computation_times": False,  # its page asks other servers for a table
+    "min_reported_time": 3600,
+}
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 3
