@@ -1,19 +1,21 @@
 # One word each, the same locally and in CI: `make run`, `make test`, `make lint`, `make docs`, `make soak`, `make bench`,
-# `make real`, `make mcu-test`, `make clean`.
+# `make real`, `make mcu-test`, `make lock`, `make clean`.
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 WALK := build/walk.mcap
 REPEATS ?= 3
+# `make test LOCKED=1`: the very versions of constraints.txt, with which all tests passed; otherwise the newest that fit.
+LOCK := $(if $(LOCKED),--constraint constraints.txt)
 
 # Flows are started by the hundred: each process would compile every module anew where this is set.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test lint docs soak bench real mcu-test clean
+.PHONY: run test lint lock docs soak bench real mcu-test clean
 
 # The environment is made once, and again when the project's needs change. A dot every two seconds says that it goes on.
 define install
-	@$(BIN)/pip install --quiet --disable-pip-version-check --editable $(1) & installing=$$!; \
+	@$(BIN)/pip install --quiet --disable-pip-version-check $(LOCK) --editable $(1) & installing=$$!; \
 	while kill -0 $$installing 2>/dev/null; do printf .; sleep 2; done; echo; wait $$installing
 	@touch $@
 endef
@@ -49,6 +51,10 @@ lint: $(BIN)/.installed
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# constraints.txt anew: the newest versions that fit, to be committed once all tests pass with them.
+lock: $(BIN)/.installed
+	$(BIN)/pip install --quiet --dry-run --ignore-installed --report - --editable '.[dev]' | $(BIN)/python .ci/lock.py > constraints.txt
 
 # What the pages say of messages, commands and settings is written from the code; the site is build/site/index.html.
 docs: $(BIN)/.installed

@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 UNIT = ROOT / "deploy" / "caneflow@.service"
@@ -64,3 +65,15 @@ def test_each_promise_of_the_readme_names_tests_that_there_are() -> None:
         named = re.findall(r"`(test_\w+)`", row)
         assert named, row
         assert set(named) <= there, row
+
+
+def test_the_locked_versions_are_whole_and_fit() -> None:
+    """Each package that pyproject.toml names is in constraints.txt, in a version that it allows."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    locked = {name.replace("_", "-"): version for name, _, version in (line.partition("==") for line in lines)}
+    extras = project["optional-dependencies"]
+    own, *tools = map(Requirement, extras["dev"])
+    named = [*project["dependencies"], *(each for extra in own.extras for each in extras[extra])]
+    for each in [*map(Requirement, named), *tools]:
+        assert each.specifier.contains(locked[each.name.lower().replace("_", "-")]), each
