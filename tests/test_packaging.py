@@ -77,3 +77,9 @@ def test_the_locked_versions_are_whole_and_fit() -> None:
     named = [*project["dependencies"], *(each for extra in own.extras for each in extras[extra])]
     for each in [*map(Requirement, named), *tools]:
         assert each.specifier.contains(locked[each.name.lower().replace("_", "-")]), each
+
+
+def test_the_version_is_the_newest_of_the_changelog() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    changes = re.findall(r"^## (\S+) - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert changes[0] == version
