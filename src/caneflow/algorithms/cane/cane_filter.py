@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.cane.speed_gate import StatedVariance
-from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
+from caneflow.algorithms.cane.walk_motion import Axes, WalkMotion, WalkMotionSettings
 from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.gyro_yaw import GyroYaw
 from caneflow.algorithms.inertial.heave import HeaveObserver, HeaveSettings
@@ -216,7 +216,7 @@ class CaneFilter(DeadReckoning):
         if elapsed > interval:
             self._bridge(stamp_ns, elapsed, arm, arm_speed)
         else:
-            self._predict(interval, acceleration, facing)
+            self._predict(interval, acceleration, _level_axes(turn, orientation))
         self._acceleration, self._arm, self._arm_speed = acceleration, arm, arm_speed
         moved = complex(*self._motion.position) - before
         turned = self._pointing.update(interval, cmath.phase(facing))
@@ -246,10 +246,10 @@ class CaneFilter(DeadReckoning):
         if self._start_height is None:
             self._start_height = height
 
-    def _predict(self, interval: float, acceleration: complex, facing: complex) -> None:
+    def _predict(self, interval: float, acceleration: complex, axes: Axes) -> None:
         mean = 0.5 * (acceleration + self._acceleration)
         if interval > 0.0:
-            self._gained += self._motion.predict(interval, (mean.real, mean.imag), facing.real, facing.imag)
+            self._gained += self._motion.predict(interval, mean, axes)
 
     def _bridge(self, stamp_ns: int, elapsed: float, arm: complex, arm_speed: complex) -> None:
         """Over a hole in the samples the hand goes on at its velocity, and the sensors turn about it."""
@@ -461,6 +461,16 @@ def level_covariance(motion: Floats, heading: Heading, turn: complex, velocity: 
     covariance[3, 4] = covariance[4, 3] = -yaw * velocity.real * velocity.imag
     covariance += turned @ motion @ turned.T
     return covariance
+
+
+def _level_axes(turn: complex, orientation: Quaternion) -> Axes:
+    """Horizontal parts of the body's axes, turned by `turn`: the first two rows of the rotation's matrix."""
+    w, x, y, z = orientation
+    return (
+        turn * complex(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)),
+        turn * complex(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z)),
+        turn * complex(2.0 * (x * z + w * y), 2.0 * (y * z - w * x)),
+    )
 
 
 def _horizontal(vector: Vector) -> complex:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings, level_covariance
 from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading
-from caneflow.algorithms.cane.walk_motion import WalkMotion, WalkMotionSettings
+from caneflow.algorithms.cane.walk_motion import STATES, Axes, WalkMotion, WalkMotionSettings
 from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized
 
 Floats = NDArray[np.float64]
 
-_JITTER: Final = 1e-15 * np.eye(7)  # the start is known exactly: its covariance has no inverse
+_JITTER: Final = 1e-15 * np.eye(STATES)  # the start is known exactly: its covariance has no inverse
 
 
 class RecordedMotion(WalkMotion):
@@ -31,10 +31,10 @@ class RecordedMotion(WalkMotion):
         self.predicted: list[tuple[Floats, Floats]] = []
         self.transitions: list[Floats] = []
 
-    def predict(self, t: float, acceleration: tuple[float, float], cos_yaw: float, sin_yaw: float) -> complex:
+    def predict(self, t: float, acceleration: complex, axes: Axes) -> complex:
         """As the filter's, and remembered."""
         self.corrected.append((np.array(self._x), self._p.copy()))
-        gained = super().predict(t, acceleration, cos_yaw, sin_yaw)
+        gained = super().predict(t, acceleration, axes)
         self.predicted.append((np.array(self._x), self._p.copy()))
         self.transitions.append(self._f.copy())
         return gained
@@ -45,7 +45,7 @@ class RecordedMotion(WalkMotion):
         self.predicted[-1] = np.array(self._x), self._p.copy()
 
     def smoothed(self) -> tuple[Floats, Floats]:
-        """States (n + 1, 7) and covariances (n + 1, 7, 7) at the start and after each of n predictions."""
+        """States (n + 1, 10) and covariances (n + 1, 10, 10) at the start and after each of n predictions."""
         x, p = np.array(self._x), self._p.copy()
         states, covariances = [x], [p]
         for index in range(len(self.transitions) - 1, -1, -1):

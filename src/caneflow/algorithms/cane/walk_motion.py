@@ -1,8 +1,11 @@
 """Velocity and position over ground in the gyro's frame: a Kalman filter on accelerometer, radar and gait.
 
-State x = (p_x, p_y, v_x, v_y, b_f, b_l, beta): position m and velocity m/s of the IMU's origin in the gyro's frame,
-bias of the accelerometer along the boresight's projection and to its left, m/s^2 (the chip's tilt error included),
-and the angle by which the cane points to the right of where its bearer walks, rad.
+State x = (p_x, p_y, v_x, v_y, b_x, b_y, b_z, t_x, t_y, beta): position m and velocity m/s of the IMU's origin in the
+gyro's frame, bias of the accelerometer along the body's axes, m/s^2, what the chip's error of tilt makes of gravity,
+m/s^2 in the gyro's frame, and the angle by which the cane points to the right of where its bearer walks, rad.
+
+Bias and tilt are two things: the bias turns with the cane and stays for a walk, the tilt errs in the world, for
+seconds. A corner turns the one by 90 deg and the other not at all.
 
 The gyro's frame turns with the errors of the gyro; a turn of a degree in three seconds does not touch velocities. What
 it does to the track is the business of heading_hypotheses.py.
@@ -10,18 +13,23 @@ it does to the track is the business of heading_hypotheses.py.
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from caneflow.algorithms.quantities import Acceleration, Angle, Density, Factor, Speed, Zero
+from caneflow.algorithms.quantities import Acceleration, Angle, Density, Factor, Speed, Time, Zero
+from caneflow.algorithms.rotations import Vector
 from caneflow.algorithms.scalar_update import update
 
 Floats = NDArray[np.float64]
 
-_PX, _PY, _VX, _VY, _BF, _BL, _BETA = range(7)
-_IDENTITY: Final = np.eye(7)
+_PX, _PY, _VX, _VY, _BX, _BY, _BZ, _TX, _TY, _BETA = range(10)
+STATES: Final = 10
+_IDENTITY: Final = np.eye(STATES)
+
+# Body axes in the gyro's frame: the horizontal parts of x, y, z, as x + jy.
+Axes: TypeAlias = tuple[complex, complex, complex]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,9 +37,12 @@ class WalkMotionSettings:
     """Noises of the filter."""
 
     velocity: Speed = 1.0  # m/s, sd at the start and after a gap
-    acceleration_noise: Density = 0.03  # m/s^2 / sqrt(Hz): a swing, sampled at 100 Hz
-    bias: Acceleration = 0.1  # m/s^2, sd at the start: 0.07 of the chip, 0.045 of 0.26 deg of tilt
-    bias_walk: Density = 0.0225  # m/s^2 / sqrt(s): that tilt, correlated over 8 s
+    # m/s^2 / sqrt(Hz): a swing sampled at 100 Hz; chosen with the three below on walks of another simulator
+    acceleration_noise: Density = 0.01
+    bias: Acceleration = 0.07  # m/s^2, sd per axis at the start (cane.md)
+    bias_walk: Density = 0.002  # m/s^2 / sqrt(s)
+    tilt: Acceleration = 0.045  # m/s^2, sd of what 0.26 deg of tilt makes of gravity (cane.md)
+    tilt_time: Time = 8.0  # s, over which it is correlated
     pointing: Angle = 0.06  # rad, sd of beta at the start
     pointing_walk: Density | Zero = 0.01  # rad / sqrt(s): a wander of 1.5 deg over some steps
     outlier: Factor = 3.0  # sd, from which on a measurement counts as that far off and no farther
@@ -42,12 +53,13 @@ class WalkMotion:
 
     def __init__(self, settings: WalkMotionSettings) -> None:
         self._settings = settings
-        self._x: list[float] = [0.0] * 7
-        sd = (1e-6, 1e-6, settings.velocity, settings.velocity, settings.bias, settings.bias, settings.pointing)
+        self._x: list[float] = [0.0] * STATES
+        s = settings
+        sd = (1e-6, 1e-6, s.velocity, s.velocity, s.bias, s.bias, s.bias, s.tilt, s.tilt, s.pointing)
         self._p: Floats = np.diag(np.square(sd))
         self._f: Floats = _IDENTITY.copy()
-        accelerations, biases = settings.acceleration_noise**2, settings.bias_walk**2
-        walks = (0.0, 0.0, accelerations, accelerations, biases, biases, settings.pointing_walk**2)
+        accelerations, biases, tilts = s.acceleration_noise**2, s.bias_walk**2, 2.0 * s.tilt**2 / s.tilt_time
+        walks = (0.0, 0.0, accelerations, accelerations, biases, biases, biases, tilts, tilts, s.pointing_walk**2)
         self._noise_rates: Floats = np.array(walks)  # variances per s
 
     @property
@@ -66,31 +78,42 @@ class WalkMotion:
         return self._x[_BETA]
 
     @property
+    def bias(self) -> Vector:
+        """Bias of the accelerometer along the body's axes, m/s^2."""
+        return self._x[_BX], self._x[_BY], self._x[_BZ]
+
+    @property
+    def tilt(self) -> complex:
+        """What the chip's error of tilt adds to the acceleration, m/s^2 in the gyro's frame, x + jy."""
+        return complex(self._x[_TX], self._x[_TY])
+
+    @property
     def covariance(self) -> Floats:
         """Of position and velocity, (4, 4); a view."""
         return self._p[:4, :4]
 
-    def predict(self, t: float, acceleration: tuple[float, float], cos_yaw: float, sin_yaw: float) -> complex:
-        """Go on by `t` s at a measured `acceleration` (m/s^2) in the gyro's frame; the boresight's yaw goes with it.
+    def predict(self, t: float, acceleration: complex, axes: Axes) -> complex:
+        """Go on by `t` s at a measured `acceleration` (m/s^2, x + jy) in the gyro's frame; `axes` are the body's there.
 
         Returns the velocity gained, m/s, as x + jy.
         """
-        x = self._x
-        gained_x = t * (acceleration[0] - cos_yaw * x[_BF] + sin_yaw * x[_BL])
-        gained_y = t * (acceleration[1] - sin_yaw * x[_BF] - cos_yaw * x[_BL])
-        x[_PX] += t * (x[_VX] + 0.5 * gained_x)
-        x[_PY] += t * (x[_VY] + 0.5 * gained_y)
-        x[_VX] += gained_x
-        x[_VY] += gained_y
+        x, (a, b, c) = self._x, axes
+        tilt = complex(x[_TX], x[_TY])
+        gained = t * (acceleration - x[_BX] * a - x[_BY] * b - x[_BZ] * c - tilt)
+        x[_PX] += t * (x[_VX] + 0.5 * gained.real)
+        x[_PY] += t * (x[_VY] + 0.5 * gained.imag)
+        x[_VX] += gained.real
+        x[_VY] += gained.imag
         f = self._f
         f[_PX, _VX] = f[_PY, _VY] = t
-        f[_VX, _BF] = f[_VY, _BL] = -t * cos_yaw
-        f[_VX, _BL], f[_VY, _BF] = t * sin_yaw, -t * sin_yaw
-        # 7 x 7 is below the size at which any BLAS takes more than one thread
+        f[_VX, _BX:_TY] = -t * a.real, -t * b.real, -t * c.real, -t
+        f[_VY, _BX:_BETA] = -t * a.imag, -t * b.imag, -t * c.imag, 0.0, -t
+        self._keep_tilt(t)
+        # 10 x 10 is below the size at which any BLAS takes more than one thread
         self._p = f @ self._p @ f.T
-        diagonal = self._p.reshape(-1)[::8]
+        diagonal = self._p.reshape(-1)[:: STATES + 1]
         diagonal += self._noise_rates * t
-        return complex(gained_x, gained_y)
+        return gained
 
     def bridge(self, t: float, moved: complex, gained: complex, speed_error: float) -> None:
         """Go on by `t` s over which nothing was measured: at the velocity of before, but for what is known.
@@ -105,10 +128,11 @@ class WalkMotion:
         x[_VY] += gained.imag
         f = self._f
         f[_PX, _VX] = f[_PY, _VY] = t
-        f[_VX, _BF] = f[_VY, _BL] = f[_VX, _BL] = f[_VY, _BF] = 0.0
+        f[_VX:_BX, _BX:] = 0.0
+        self._keep_tilt(t)
         self._p = f @ self._p @ f.T
-        diagonal = self._p.reshape(-1)[::8]
-        diagonal[_BF:] += self._noise_rates[_BF:] * t
+        diagonal = self._p.reshape(-1)[:: STATES + 1]
+        diagonal[_BX:] += self._noise_rates[_BX:] * t
         variance = speed_error**2
         for position, velocity in ((_PX, _VX), (_PY, _VY)):
             self._p[velocity, velocity] += variance
@@ -118,7 +142,7 @@ class WalkMotion:
 
     def coast(self, t: float) -> None:
         """Go on by `t` s over which nothing was measured: the velocity holds, and is as unknown as at the start."""
-        self.predict(t, self._bias_in(1.0, 0.0), 1.0, 0.0)
+        self.predict(t, complex(self._x[_TX], self._x[_TY]), (0j, 0j, 0j))
         for axis in (_VX, _VY):
             self._p[axis, :] = self._p[:, axis] = 0.0
             self._p[axis, axis] = self._settings.velocity**2
@@ -155,6 +179,9 @@ class WalkMotion:
             self._p[position, velocity] += speed**2 * lasting
             self._p[velocity, position] += speed**2 * lasting
 
-    def _bias_in(self, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
-        forward, left = self._x[_BF], self._x[_BL]
-        return cos_yaw * forward - sin_yaw * left, sin_yaw * forward + cos_yaw * left
+    def _keep_tilt(self, t: float) -> None:
+        """What is left of the tilt's error after `t` s."""
+        left = math.exp(-t / self._settings.tilt_time)
+        self._x[_TX] *= left
+        self._x[_TY] *= left
+        self._f[_TX, _TX] = self._f[_TY, _TY] = left
