@@ -325,3 +325,27 @@ def test_a_stated_error_of_nothing_is_not_believed() -> None:
         estimate = cane.imu(START_NS + index * PERIOD_NS, ImuReading((0.0, 0.0, 0.0), force, orientation=body))
     assert estimate.covariance is not None
     assert 0.004**2 < estimate.covariance[3, 3] < 0.02**2
+
+
+def test_a_radar_that_moves_sideways_is_believed_less() -> None:
+    """Beside a first velocity all else is vague, so its variance is the filter's: stated, twice, and the sideways."""
+    variances = []
+    for reach, rate in ((0.0, 2.0), (1.0, 2.0)):  # m from the IMU to the antenna, rad/s: no and 1.5 m/s to the side
+        settings = CaneFilterSettings(velocity_correlation=0.1, sideways_share=0.14)
+        cane = CaneFilter(settings, boresight=BORESIGHT, pivot=PIVOT, antenna=(0.0, reach, 0.0))
+        for index in range(12):
+            orientation = held(rate * 0.01 * index)
+            inverse = conjugate(orientation)
+            stamp_ns = START_NS + index * PERIOD_NS
+            reading = ImuReading(
+                rotate(inverse, (0.0, 0.0, rate)), rotate(inverse, (0.0, 0.0, GRAVITY)), orientation=orientation
+            )
+            estimate = cane.imu(stamp_ns, reading)
+            if index in (5, 10):  # the first one after a silence is not believed yet
+                cane.velocity(stamp_ns, (0.0, 0.0001), (0.04, 0.0, UNOBSERVED), 0.0)
+        assert estimate.covariance is not None
+        ahead = np.array([math.cos(rate * 0.11), math.sin(rate * 0.11)])
+        variance = float(ahead @ estimate.covariance[3:5, 3:5] @ ahead) / settings.covariance_share
+        variances.append(1.0 / (1.0 / variance - 1.0))
+    assert variances[0] == pytest.approx(0.08, rel=0.05)
+    assert variances[1] == pytest.approx(0.08 + (0.14 * 2.0 * math.cos(PITCH)) ** 2, rel=0.05)

@@ -37,10 +37,13 @@ class CaneFilterSettings:
     """What the filter may be told; units on each line."""
 
     # s over which radar velocities err alike (their window, and the speckle they stand on): as white noise, those
-    # that come more often are worth less each
-    velocity_correlation: Time = 0.04
+    # that come more often are worth less each. Neighbours 50 ms apart correlate by 0.25 to 0.35, so each is worth half
+    velocity_correlation: Time = 0.1
     # m/s, sd of a radar velocity at the least, whatever it states: the best of 20 walks was 0.02
     velocity_error: Speed = 0.015
+    # of the sideways speed, sd of a radar velocity beside what it states: the beam's azimuths then close unlike, and
+    # which of them are lit is chance
+    sideways_share: Factor | Zero = 0.14
     hole: Time = 0.12  # s between IMU samples, from which on acceleration and turn rate are not interpolated
     hole_speed: Speed = 0.15  # m/s, sd of what the hand's velocity changes over a hole (estimators.md)
     hole_speed_time: Time = 0.3  # s in which it changes by that much; as a random walk, over other holes
@@ -282,7 +285,9 @@ class CaneFilter(DeadReckoning):
             if not abs(then.facing) > _VERTICAL:
                 continue  # a boresight that points straight up or down tells no direction
             facing = then.facing / abs(then.facing)
-            sides = ((facing, measured.forward, measured.xx), (facing * 1j, measured.left, measured.yy))
+            sideways = ((complex(*self._motion.velocity) - since) / (facing * 1j)).real
+            doubt = (self._settings.sideways_share * sideways) ** 2
+            sides = ((facing, measured.forward, measured.xx + doubt), (facing * 1j, measured.left, measured.yy))
             for direction, value, variance in sides:
                 if variance < _UNOBSERVED:
                     self._observe(measured.stamp_ns, direction, value + (since * direction.conjugate()).real, variance)
