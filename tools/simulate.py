@@ -1,7 +1,9 @@
 """`caneflow simulate`: recordings of walks that nobody walked, with the truth beside them."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal, TypeAlias
@@ -21,10 +23,11 @@ from caneflow.simulation.ranger import Readings
 from caneflow.simulation.room_cane import CaneInRoom, simulate_cane_in_room
 from caneflow.simulation.room_course import RoomShape
 from caneflow.simulation.room_scenario import PARTS, SENSORS, Part, RoomRecording, World, room_settings, simulate_room
-from caneflow.simulation.scenario import SCENARIOS, Walk, simulate_walk
+from caneflow.simulation.scenario import SCENARIOS, Walk, WalkSettings, simulate_walk, walk_settings
 
 RECORDING = ".mcap"  # the end of a file's name; another output of `simulate room` is a folder
 CANE, ROOM, CANE_IN_ROOM = "cane", "room", "cane_in_room"  # flows
+REAL = "What recordings of real devices have"  # options under one heading of the help
 IMU, RADAR = ("imu", "imu"), ("radar", "frame")
 
 Samples: TypeAlias = Iterator[tuple[tuple[str, str], int, Sample]]  # node and port, number within the stream, sample
@@ -44,9 +47,107 @@ def walk(
         float | None,
         typer.Option(metavar="S", min=0.1, help="s; by default until the course has been walked (swing: 53 s)."),
     ] = None,
+    noise_rise: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DB",
+            min=0,
+            max=40,
+            help="dB of the radar's noise in its band over the rest, the sum as it was. Recorded P440s: 8 to 12.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    glitches: Annotated[
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            min=0,
+            max=100,
+            help="Hz at which a reading of the IMU is any 16-bit value: an I2C bus that stretches its clock.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    holes: Annotated[
+        float | None,
+        typer.Option(
+            metavar="N",
+            min=0,
+            max=1000,
+            help="How many times a minute the IMU is silent, for 0.05 to 0.65 s: slow reads, resets of a BNO055.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    scan_loss: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PART",
+            min=0,
+            max=0.9,
+            help="The part of the scans that is lost, in gaps of one to three. A recorded P440 by UDP: 0.09.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    carrier_off: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PART",
+            min=-0.4,
+            max=0.4,
+            help="The part by which the stated carrier is over the true one. Recorded P440s: 0.05 to 0.075.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    equal_stamps: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PART",
+            min=0,
+            max=0.9,
+            help="The part of the IMU's samples that got one stamp with the one before; spread as on import.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    rig_shift: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", min=0, max=0.2, help="m by which each length of the stated rig is wrong.", rich_help_panel=REAL
+        ),
+    ] = None,
+    rig_turn: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEG",
+            min=0,
+            max=45,
+            help="deg between the stated boresight and the true one.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    field_turn: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEG",
+            min=0,
+            max=180,
+            help="deg by which the magnetic field turns, once, 10 to 40 s after the beginning.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
+    field_wander: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEG",
+            min=0,
+            max=180,
+            help="deg, sd, by which the field's direction wanders within 40 s.",
+            rich_help_panel=REAL,
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate a walk with a white cane: IMU and radar at 100 Hz, and where the cane truly was.
+
+    What recordings of real devices have besides goes with any scenario; `field` has all of it.
 
     With --scene also two range sensors at 15 Hz, and where everything stands (metadata record `scene`).
 
@@ -54,7 +155,22 @@ def walk(
 
     Example: caneflow simulate walk --scene approach --thing pole --seed 3 -o pole_3.mcap
     """
+    faults = {
+        "noise_rise": noise_rise,
+        "glitches": glitches,
+        "holes": holes,
+        "scan_loss": scan_loss,
+        "carrier_off": carrier_off,
+        "equal_stamps": equal_stamps,
+        "rig_shift": rig_shift,
+        "rig_turn": None if rig_turn is None else math.radians(rig_turn),
+        "field_turn": None if field_turn is None else math.radians(field_turn),
+        "field_wander": None if field_wander is None else math.radians(field_wander),
+    }
+    asked = {name: value for name, value in faults.items() if value is not None}
     if scene is not None:
+        if asked:
+            raise typer.BadParameter("a scene has none of it", param_hint=f"--{next(iter(asked)).replace('_', '-')}")
         if scenario is not None:
             raise typer.BadParameter("a scene has a walk of its own; use one of the two", param_hint="--scenario")
         guided_walk(output, scene, thing, seed, duration, overwrite=overwrite)
@@ -66,10 +182,19 @@ def walk(
         raise typer.BadParameter(f"no walk {scenario!r}; there are {', '.join(SCENARIOS)}", param_hint="--scenario")
     with whole(output, overwrite=overwrite) as recording:
         with progress_bar(f"{scenario}, seed {seed}") as progress:
-            walked = simulate_walk(scenario, seed, duration, progress)
+            walked = simulate_walk(_with_faults(walk_settings(scenario, seed), asked), seed, duration, progress)
         written(recording, CANE, walked.rig, samples_of(walked))
     seconds = float(walked.stamps_ns[-1] - walked.stamps_ns[0]) / 1e9
     print(f"{output}: {scenario}, seed {seed}: {len(walked.stamps_ns)} samples a stream, {seconds:.2f} s")
+
+
+def _with_faults(settings: WalkSettings, asked: Mapping[str, float]) -> WalkSettings:
+    """The settings with what was asked for, each in the part that has a setting of this name."""
+    for part in ("radar", "imu", "faults"):
+        before = getattr(settings, part)
+        own = {name: value for name, value in asked.items() if hasattr(before, name)}
+        settings = replace(settings, **{part: replace(before, **own)})
+    return settings
 
 
 def guided_walk(
@@ -186,10 +311,19 @@ def written(
 
 
 def samples_of(walked: Walk) -> Samples:
-    """At each instant what the IMU and the radar say, and the truth."""
-    for i in range(len(walked.stamps_ns)):
-        yield from cane_samples(walked, i)
-        yield TRUTH, i, true_pose(walked, i)
+    """What came from the IMU and the radar, numbered as it came, and the truth, in the order of the stamps."""
+    numbers = dict.fromkeys((IMU, RADAR), 0)
+    waiting: list[tuple[tuple[str, str], int, Sample]] = []  # stamped later than they are
+    for i, now in enumerate(walked.stamps_ns.tolist()):
+        for name, _, sample in cane_samples(walked, i):
+            if came(walked, name, i):
+                waiting.append((name, numbers[name], sample))
+                numbers[name] += 1
+        waiting.append((TRUTH, i, true_pose(walked, i)))
+        waiting.sort(key=lambda each: each[2].stamp)
+        while waiting and waiting[0][2].stamp <= now:
+            yield waiting.pop(0)
+    yield from waiting
 
 
 def guided_samples(walked: GuidedWalk) -> Samples:
@@ -218,14 +352,22 @@ def _reading(readings: Mapping[str, Readings], stamp: int, name: str, i: int) ->
     return (name, "ranges"), i, reading
 
 
+def came(walked: Walk, name: tuple[str, str], i: int) -> bool:
+    """Whether the sample of instant `i` came through."""
+    if walked.received is None:
+        return True
+    return bool((walked.received.imu_kept if name == IMU else walked.received.scan_kept)[i])
+
+
 def cane_samples(walked: Walk, i: int) -> Samples:
     """What the cane's IMU and radar say at instant `i`."""
     imu, stamp = walked.imu, int(walked.stamps_ns[i])
+    imu_stamp = stamp if walked.received is None else int(walked.received.imu_stamps_ns[i])
     yield (
         IMU,
         i,
         Imu(
-            stamp=stamp,
+            stamp=imu_stamp,
             gyro=tuple(imu.gyro[i].tolist()),
             accel=tuple(imu.accel[i].tolist()),
             mag=tuple(imu.mag[i].tolist()),

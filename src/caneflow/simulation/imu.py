@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from caneflow.physics import LOCAL_GRAVITY
 from caneflow.simulation import attitude
 from caneflow.simulation.attitude import DEGREE, Floats
+from caneflow.simulation.smooth_noise import slow
 from caneflow.simulation.walk import RATE, Motion
 
 NotNegative = Annotated[float, Ge(0)]
@@ -36,6 +37,10 @@ class ImuSettings:
     heading_time: Annotated[float, Gt(0)] = 5.0  # s in which the heading is pulled to the field (cane.md)
     field_error: NotNegative = 10.0 * DEGREE  # rad, sd of the field's direction indoors (cane.md)
     field_scale: Annotated[float, Gt(0)] = 2.0  # m over which it errs (cane.md)
+    # A field that changes in time, as by lifts, doors, trains and what is carried: chosen, nobody has measured it
+    field_turn: NotNegative = 0.0  # rad by which it turns once, either way, at a time within FIELD_TURNS
+    field_wander: NotNegative = 0.0  # rad, sd of its direction
+    wander_time: Annotated[float, Gt(0)] = 40.0  # s over which that wanders
 
 
 class ImuSamples(NamedTuple):
@@ -71,7 +76,7 @@ def measure(motion: Motion, settings: ImuSettings, rng: Generator) -> ImuSamples
     The sensors' low-pass filters are symmetric, so that a sample's stamp is the middle of what it measures. The
     samples of a shorter motion are the beginning of those of the longer one, but for the filters' last 10 ms.
     """
-    gyro_rng, accel_rng, mag_rng, field_rng, fusion_rng = rng.spawn(5)
+    gyro_rng, accel_rng, mag_rng, field_rng, fusion_rng, time_rng = rng.spawn(6)
     orientation, position = motion.orientation[::_EVERY], motion.position[::_EVERY]
     count = len(orientation)
     rate = _low_passed(motion.rate, _GYRO_BAND)[::_EVERY]
@@ -80,7 +85,7 @@ def measure(motion: Motion, settings: ImuSettings, rng: Generator) -> ImuSamples
         attitude.conjugate(motion.orientation), motion.acceleration + np.array([0.0, 0.0, LOCAL_GRAVITY])
     )
     accel = _accel(_low_passed(force, _ACCEL_BAND)[::_EVERY], settings, accel_rng)
-    field = magnetic_field(position, settings, field_rng)
+    field = _changed(magnetic_field(position, settings, field_rng), motion.time[::_EVERY], settings, time_rng)
     to_body = attitude.conjugate(orientation)
     mag = attitude.rotate(to_body, field) + mag_rng.normal(0.0, 1.0, (count, 3)) * settings.mag_noise
     mag = mag[np.arange(count) // _MAG_EVERY * _MAG_EVERY]
@@ -117,6 +122,19 @@ def magnetic_field(position: Floats, settings: ImuSettings, rng: Generator) -> F
     return np.asarray(EARTH_FIELD + np.hstack([horizontal, vertical]), dtype=np.float64)
 
 
+def _changed(field: Floats, time: Floats, settings: ImuSettings, rng: Generator) -> Floats:
+    """The field (n, 3), uT, turned about the vertical by what changes in `time`, (n,) s."""
+    if not (settings.field_turn or settings.field_wander):
+        return field
+    begins, side = rng.uniform(*FIELD_TURNS), 1.0 if rng.random() < 0.5 else -1.0
+    turned = side * settings.field_turn * np.clip((time - begins) / FIELD_TURN_TIME, 0.0, 1.0)
+    turned = turned + slow(rng, settings.field_wander, settings.wander_time)(time)
+    about = np.column_stack([np.zeros((len(time), 2)), turned])
+    return attitude.rotate(attitude.from_rotation_vector(about), field)
+
+
+FIELD_TURNS = (10.0, 40.0)  # s after the beginning
+FIELD_TURN_TIME = 1.0  # s
 _FIELD_HEIGHT = 0.75  # m at which the anomaly has the strength that is asked for: the sensors' height
 
 

@@ -42,6 +42,9 @@ class RadarSettings:
     # noise's, both per real sample (cane.md: 15 dB)
     snr: float = 15.0  # dB
     noise: Annotated[float, Gt(0)] = 200.0  # LSB, white up to 8.2 GHz: a P440's recorded scans (p440-rail-mocap)
+    # What is received between 3 and 5 GHz over what the receiver makes itself: 8 dB (p440-udp-loss, test_scan711_1000)
+    # to 12 dB (test_scan2) in differences of scans of rooms at rest; as it is white noise of the same power by default
+    noise_rise: Annotated[float, Ge(0)] = 0.0  # dB, of the noise's density within the band
     jitter: Annotated[float, Ge(0)] = 0.15e-12  # s, sd per scan: that recording's strongest echo while it stands
     # Direct coupling: an antenna's ring-down, at its strongest above the strongest floor echo; both chosen
     coupling: float = 26.0  # dB
@@ -87,11 +90,23 @@ def scans(
         draws = noise_rng.normal(0.0, 1.0, (len(analytic), settings.bins + 1))
         # a shift of a picosecond is nothing to the envelope (0.15 mm), but 0.03 rad to the phase
         late = 2.0 * np.pi * settings.carrier * settings.jitter * draws[:, :1]
-        received = gain * (analytic * np.exp(-1j * late)).real + settings.noise * draws[:, 1:]
+        received = gain * (analytic * np.exp(-1j * late)).real + settings.noise * _coloured(draws[:, 1:], settings)
         out[block] = np.rint(received)
         if progress is not None:
             progress(block.stop / count)
     return out
+
+
+def _coloured(noise: Floats, settings: RadarSettings) -> Floats:
+    """White noise (n, bins) with more of its power where the pulse is, and the same in all."""
+    if not settings.noise_rise:
+        return noise
+    spacing = 2.0 * RANGE_STEP / SPEED_OF_LIGHT  # s
+    frequency = np.fft.rfftfreq(settings.bins, spacing)
+    within = np.abs(frequency - settings.carrier) < 0.5 * settings.bandwidth
+    density = np.where(within, 10.0 ** (settings.noise_rise / 10.0), 1.0)
+    shaped: Floats = np.fft.irfft(np.fft.rfft(noise) * np.sqrt(density / density.mean()), settings.bins)
+    return shaped
 
 
 def echoes(

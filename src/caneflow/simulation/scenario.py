@@ -14,6 +14,7 @@ from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
 from caneflow.simulation.attitude import DEGREE, Floats
+from caneflow.simulation.field_faults import FieldFaults, Received, glitched, received, stated_rig
 from caneflow.simulation.imu import SAMPLE_RATE, ImuSamples, ImuSettings, measure
 from caneflow.simulation.radar import RANGE_STEP, RadarSettings, scans
 from caneflow.simulation.scene import SceneSettings, scene
@@ -31,6 +32,7 @@ class WalkSettings:
     scene: SceneSettings = field(default_factory=SceneSettings)
     radar: RadarSettings = field(default_factory=RadarSettings)
     imu: ImuSettings = field(default_factory=ImuSettings)
+    faults: FieldFaults = field(default_factory=FieldFaults)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +54,8 @@ class Walk:
     carrier: float  # Hz
     bandwidth: float  # Hz
 
-    rig: Mapping[str, object]  # as in wire.md
+    rig: Mapping[str, object]  # as in wire.md, as it is stated
+    received: Received | None = None  # None: every sample and scan, with its own stamp
 
 
 def simulate_walk(
@@ -70,25 +73,30 @@ def simulate_walk(
     settings = walk_settings(scenario, seed) if isinstance(scenario, str) else scenario
     if duration is not None and not duration > 0.0:
         raise ValueError(f"a walk of {duration} s; the duration must be > 0 s")
-    _, person_rng, scene_rng, radar_rng, imu_rng = _generators(seed)
+    _, person_rng, scene_rng, radar_rng, imu_rng, faults_rng = _generators(seed)
+    faults = settings.faults
+    glitch_rng, received_rng, rig_rng = faults_rng.spawn(3)
+    radar = replace(settings.radar, carrier=settings.radar.carrier / (1.0 + faults.carrier_off))
     motion = walk(settings.motion, settings.rig, person_rng, duration)
     room = scene(settings.scene, course_of(settings.motion), scene_rng)
     sampled = Motion(*(values[:: RATE // SAMPLE_RATE] for values in motion))
-    received = scans(sampled, room, settings.rig, settings.motion.pitch, settings.radar, radar_rng, progress)
+    heard = scans(sampled, room, settings.rig, settings.motion.pitch, radar, radar_rng, progress)
     period_ns = 1_000_000_000 // SAMPLE_RATE
+    stamps_ns = EPOCH_NS + period_ns * np.arange(len(sampled.time), dtype=np.int64)
     return Walk(
-        stamps_ns=EPOCH_NS + period_ns * np.arange(len(sampled.time), dtype=np.int64),
-        imu=measure(motion, settings.imu, imu_rng),
+        stamps_ns=stamps_ns,
+        imu=glitched(measure(motion, settings.imu, imu_rng), faults, glitch_rng),
         position=sampled.position,
         velocity=sampled.velocity,
         orientation=sampled.orientation,
-        scans=received,
+        scans=heard,
         scan_period=1.0 / SAMPLE_RATE,
         range_start=settings.radar.range_start,
         range_step=RANGE_STEP,
         carrier=settings.radar.carrier,
         bandwidth=settings.radar.bandwidth,
-        rig=settings.rig.as_map(),
+        rig=stated_rig(settings.rig, faults, rig_rng),
+        received=received(stamps_ns, faults, received_rng),
     )
 
 
@@ -100,10 +108,10 @@ def walk_settings(scenario: str, seed: int) -> WalkSettings:
 
 
 def _generators(seed: int) -> list[Generator]:
-    """Of the scenario, the person, the scene, the radar and the IMU."""
+    """Of the scenario, the person, the scene, the radar, the IMU and the faults."""
     if seed < 0:
         raise ValueError(f"seed {seed}; it must be 0 or more")
-    return [default_rng(child) for child in SeedSequence(seed).spawn(5)]
+    return [default_rng(child) for child in SeedSequence(seed).spawn(6)]
 
 
 def _swing(rng: Generator) -> WalkSettings:
@@ -210,6 +218,31 @@ def _step_back(rng: Generator) -> WalkSettings:
     return WalkSettings(motion=replace(motion, pauses=(back,)))
 
 
+def _field(rng: Generator) -> WalkSettings:
+    """The paper's walk with everything at once that recordings of real devices have; field_faults.py has the sources.
+
+    Rates are chosen where no recording states them, before any method was run on it.
+    """
+    motion, turns = _motion(rng), _coin(rng)
+    return WalkSettings(
+        motion=motion,
+        radar=RadarSettings(noise_rise=10.0),
+        imu=ImuSettings(
+            field_turn=DEGREE * 30.0 if turns else 0.0,
+            field_wander=0.0 if turns else DEGREE * 15.0,
+        ),
+        faults=FieldFaults(
+            glitches=0.2,
+            holes=3.0,
+            scan_loss=0.09,
+            carrier_off=0.02 if _coin(rng) else -0.02,
+            equal_stamps=0.02,
+            rig_shift=0.05,
+            rig_turn=5.0 * DEGREE,
+        ),
+    )
+
+
 SCENARIOS: Mapping[str, Callable[[Generator], WalkSettings]] = MappingProxyType(
     {
         "swing": _swing,
@@ -222,6 +255,7 @@ SCENARIOS: Mapping[str, Callable[[Generator], WalkSettings]] = MappingProxyType(
         "slow": _slow,
         "brisk": _brisk,
         "step_back": _step_back,
+        "field": _field,
     }
 )
 
