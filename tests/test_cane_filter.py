@@ -46,6 +46,7 @@ class Walk:
     gyro_bias: float = 0.0  # about the vertical and, as a bad gyro has it, about the level axes of the body
     north: Floats | None = None  # rad, by which the field errs
     noise: float = 0.0  # m/s, sd of the radar
+    alike: float = 0.0  # correlation of neighbouring errors of the radar
     seed: int = 0
     truth: Floats = field(init=False)  # (n, 2) m
 
@@ -72,13 +73,14 @@ def run(
     rates = np.gradient(np.unwrap(walk.yaws), 0.01)
     bias = rotate(conjugate(held(0.0)), (walk.gyro_bias, walk.gyro_bias, walk.gyro_bias))
     lost = set(range(len(walk.yaws))[dropped])
-    estimates = []
+    estimates, error = [], 0.0
     for index, yaw in enumerate(walk.yaws.tolist()):
         if index in lost:
             continue
         stamp_ns = START_NS + index * PERIOD_NS
         back = max(index - delay, 0)
-        seen = velocity[back] @ (math.cos(walk.yaws[back]), math.sin(walk.yaws[back])) + walk.noise * rng.normal()
+        error = walk.alike * error + math.sqrt(1.0 - walk.alike**2) * float(rng.normal())
+        seen = velocity[back] @ (math.cos(walk.yaws[back]), math.sin(walk.yaws[back])) + walk.noise * error
 
         def radar(stamp_ns: int = stamp_ns, seen: float = float(seen)) -> None:
             if speeds_only:
@@ -190,7 +192,7 @@ def test_a_heading_that_cannot_be_known_shows_in_the_covariance() -> None:
 
 
 def test_the_final_error_is_of_the_size_that_the_covariance_says() -> None:
-    """Loops with gyro biases of sd 0.1 deg/s in rooms with 14 deg of field errors; the radar's noise is white here.
+    """Loops with gyro biases of sd 0.1 deg/s in rooms with 14 deg of field errors; the radar errs alike for 0.1 s.
 
     The long test in test_cane_filter_walks.py does it on simulated radar, which is less kind.
     """
@@ -199,7 +201,9 @@ def test_the_final_error_is_of_the_size_that_the_covariance_says() -> None:
         rng = np.random.default_rng(seed)
         waves, phases = rng.normal(0.0, 1 / 1.8, (4, 2)), rng.uniform(0.0, 2 * math.pi, 4)
         north = 14 * DEGREE * math.sqrt(0.5) * np.sin(loop().truth @ waves.T + phases).sum(axis=1)
-        walk = loop(gyro_bias=rng.normal(0.0, 0.1) * DEGREE, north=north - north[0], noise=0.05, seed=seed)
+        walk = loop(
+            gyro_bias=rng.normal(0.0, 0.1) * DEGREE, north=north - north[0], noise=0.05, alike=9 / 11, seed=seed
+        )
         _, estimates = run(walk)
         covariance = estimates[-1].covariance
         assert covariance is not None

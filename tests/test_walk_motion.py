@@ -23,8 +23,11 @@ def test_agrees_with_full_matrices() -> None:
     motion = WalkMotion(settings)
     rng = np.random.default_rng(1)
     x = np.zeros(STATES)
-    p = np.diag(np.square([1e-6, 1e-6, *[s.velocity] * 2, *[s.bias] * 3, *[s.tilt] * 2, s.pointing]))
-    for _ in range(200):
+    p = np.diag(np.square([1e-6, 1e-6, *[s.velocity] * 2, *[s.bias] * 3, *[s.tilt] * 2, s.pointing, *[1e-6] * 4]))
+    marked = np.eye(STATES)
+    marked[10:12, 10:12], marked[10:12, 0:2] = 0.0, np.eye(2)
+    marked[12:14, 12:14], marked[12:14, 10:12] = 0.0, np.eye(2)
+    for index in range(200):
         t, yaw = rng.uniform(0.005, 0.03), rng.uniform(-3, 3)
         ax, ay = rng.normal(0, 2, 2)
         axes = level(yaw, -0.7)
@@ -38,16 +41,33 @@ def test_agrees_with_full_matrices() -> None:
         x = f @ x
         x[:4] += np.concatenate([0.5 * t * gained, t * np.array([ax, ay])])
         tilts = 2.0 * s.tilt**2 / s.tilt_time
-        rates = [0, 0, *[s.acceleration_noise**2] * 2, *[s.bias_walk**2] * 3, tilts, tilts, s.pointing_walk**2]
+        rates = [
+            0,
+            0,
+            *[s.acceleration_noise**2] * 2,
+            *[s.bias_walk**2] * 3,
+            tilts,
+            tilts,
+            s.pointing_walk**2,
+            *[0] * 4,
+        ]
         p = f @ p @ f.T + np.diag(rates) * t
         direction, value, variance, slope = rng.uniform(-3, 3), rng.normal(), rng.uniform(0.01, 1), rng.normal()
         along = (math.cos(direction), math.sin(direction))
-        motion.observe_velocity(along, value, variance, per_pointing=slope)
-        h = np.array([0, 0, *along, *[0] * 5, slope])
+        if index % 10 == 9:
+            motion.observe_way(along, value, variance, per_pointing=slope)
+            h = np.array([*along, *[0] * 7, slope, 0, 0, -along[0], -along[1]])
+        else:
+            motion.observe_velocity(along, value, variance, per_pointing=slope)
+            h = np.array([0, 0, *along, *[0] * 5, slope, *[0] * 4])
         gain = p @ h / (h @ p @ h + variance)
         x = x + gain * (value - h @ x)
         keep = np.eye(STATES) - np.outer(gain, h)
         p = keep @ p @ keep.T + np.outer(gain, gain) * variance
+        if index % 10 == 9:
+            assert motion.way == pytest.approx(complex(*(x[0:2] - x[12:14])), abs=1e-9)
+            motion.mark()
+            x, p = marked @ x, marked @ p @ marked.T
     np.testing.assert_allclose((*motion.position, *motion.velocity), x[:4], atol=1e-9)
     np.testing.assert_allclose(motion.covariance, p[:4, :4], rtol=1e-6, atol=1e-12)
     assert motion.pointing == pytest.approx(x[9])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.cane.speed_gate import StatedVariance
+from caneflow.algorithms.cane.swing_marks import SwingMarks
 from caneflow.algorithms.cane.walk_motion import Axes, WalkMotion, WalkMotionSettings
 from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.inertial.gyro_yaw import GyroYaw
@@ -28,7 +29,7 @@ from caneflow.algorithms.inertial.imu_sample import (
     world_acceleration,
 )
 from caneflow.algorithms.inertial.standing import StandingDetector, StandingSettings
-from caneflow.algorithms.quantities import Density, Factor, Fraction, Length, Offset, Speed, Time, TurnRate, Zero
+from caneflow.algorithms.quantities import Angle, Density, Factor, Fraction, Length, Offset, Speed, Time, TurnRate, Zero
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized, rotate
 
 
@@ -55,10 +56,16 @@ class CaneFilterSettings:
     # m/s per sqrt(s), by which the velocity may go astray beside what the filter knows of the accelerometer, while no
     # radar tells it: the chip's tilt and what the last velocities before a silence had wrong
     unseen_drift: Speed = 0.1
-    sideways: Speed = 0.1  # m/s, sd of the hand's velocity across the way the cane points
+    # m/s, sd of the hand's velocity across the way the cane points; with what the ways below say, chosen on walks of
+    # another simulator
+    sideways: Speed = 0.15
     sideways_interval: Time = 0.1  # s
     sideways_memory: Time = 1.0  # s over which swinging and turning are noticed
-    sideways_per_turn: Length | Zero = 0.3  # m: (m/s) of doubt per (rad/s) of swinging or turning
+    sideways_per_turn: Length | Zero = 0.7  # m: (m/s) of doubt per (rad/s) of swinging or turning
+    way_error: Length = 0.05  # m, sd of the hand's way across the mean direction of the cane over a full swing
+    way_share: Factor | Zero = 0.15  # of that way, sd beside it
+    way_per_turn: Length | Zero = 0.3  # m, sd per rad by which the body turned meanwhile
+    swing_back: Angle = math.radians(4.0)  # rad that the cane goes back before it counts as having turned
     hand_ahead: Offset = 0.3  # m that the hand is carried ahead of the body: it goes sideways when the body turns
     standing_speed: Speed = 0.03  # m/s, sd of the sensors' while the bearer stands
     standing_inflation: Factor = 20.0  # samples that share one drift of the hand
@@ -129,6 +136,7 @@ class CaneFilter(DeadReckoning):
         self._yaw = GyroYaw()
         self._standing = StandingDetector(settings.standing)
         self._pointing = _Pointing(settings.sideways_memory)
+        self._swing = SwingMarks(settings.swing_back)
         self._motion = motion or WalkMotion(settings.motion)
         self.heading = HeadingHypotheses(settings.heading)
         self._heave = HeaveObserver(settings.heave)
@@ -139,6 +147,7 @@ class CaneFilter(DeadReckoning):
         self._acceleration = 0j  # m/s^2 in the gyro's frame, of the last sample
         self._last_velocity_ns: int | None = None
         self._disagree_ns: int | None = None  # stamp of the first of the outliers that the last velocities were
+        self._facing = 1.0 + 0j  # the boresight's projection in the gyro's frame, as of the last sample
         self._arm = self._arm_speed = 0j  # m, m/s in the gyro's frame: from the IMU to the hand, as of the last sample
         self._turns = _TurnDoubt()
         self._lonely = False  # the last velocity came after a silence
@@ -221,12 +230,15 @@ class CaneFilter(DeadReckoning):
         else:
             self._predict(interval, acceleration, _level_axes(turn, orientation))
         self._acceleration, self._arm, self._arm_speed = acceleration, arm, arm_speed
+        self._facing = facing
         moved = complex(*self._motion.position) - before
         turned = self._pointing.update(interval, cmath.phase(facing))
         self._remember(stamp_ns, turn, facing, orientation, gyro)
         self._take_velocities(stamp_ns)
         self._open_while_unseen(stamp_ns, interval)
         self._use_gait(interval, stands, turn, orientation, gyro)
+        if self._swing.update(elapsed, turned):
+            self._use_way()
         self._correction += complex(*self._motion.position) - before - moved
         shown = self._correction * min(elapsed / self._settings.correction_time, 1.0)
         self._correction -= shown
@@ -264,6 +276,7 @@ class CaneFilter(DeadReckoning):
             self._motion.bridge(elapsed, moved, gained, speed_error)
         else:
             self._motion.coast(elapsed)
+            self._swing.forget()
         self._gained += gained
         variance = (s.hole_turn * elapsed) ** 2
         self.heading.doubt(variance)
@@ -351,6 +364,22 @@ class CaneFilter(DeadReckoning):
             value -= (lever * left.conjugate()).real + speed * motion.pointing
             variance = settings.sideways**2 + settings.sideways_per_turn**2 * self._pointing.turning
             motion.observe_velocity((left.real, left.imag), value, variance, per_pointing=-speed)
+
+    def _use_way(self) -> None:
+        """Over a full swing the hand goes where the cane pointed in the mean, but for what a turning body adds."""
+        settings, motion, swing = self._settings, self._motion, self._swing
+        since = swing.full(cmath.phase(self._facing), self._arm)
+        if since is not None:
+            ahead = cmath.rect(1.0, since.yaw + motion.pointing)
+            left = ahead * 1j
+            way = motion.way + since.arm
+            along = (way * ahead.conjugate()).real
+            value = settings.hand_ahead * 2.0 * math.sin(0.5 * since.turned)
+            value -= (since.arm * left.conjugate()).real + along * motion.pointing
+            variance = settings.way_error**2 + (settings.way_share * abs(way)) ** 2
+            variance += (settings.way_per_turn * since.turned) ** 2
+            motion.observe_way((left.real, left.imag), value, variance, per_pointing=-along)
+        motion.mark()
 
     def _see_field(self, orientation: Quaternion, mag: Vector | None) -> None:
         """Direction of the field in the gyro's frame; without a magnetometer, of what the chip takes for north."""

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings, level_covariance
 from caneflow.algorithms.cane.dead_reckoning import PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading
-from caneflow.algorithms.cane.walk_motion import STATES, Axes, WalkMotion, WalkMotionSettings
+from caneflow.algorithms.cane.walk_motion import Axes, WalkMotion, WalkMotionSettings
 from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.rotations import Quaternion, Vector, from_yaw, multiply, normalized
 
 Floats = NDArray[np.float64]
 
-_JITTER: Final = 1e-15 * np.eye(STATES)  # the start is known exactly: its covariance has no inverse
+_KEPT: Final = 10  # states but for the marks, which are places of before
+_JITTER: Final = 1e-15 * np.eye(_KEPT)  # the start is known exactly: its covariance has no inverse
 
 
 class RecordedMotion(WalkMotion):
@@ -33,20 +34,23 @@ class RecordedMotion(WalkMotion):
 
     def predict(self, t: float, acceleration: complex, axes: Axes) -> complex:
         """As the filter's, and remembered."""
-        self.corrected.append((np.array(self._x), self._p.copy()))
+        self.corrected.append(self._now())
         gained = super().predict(t, acceleration, axes)
-        self.predicted.append((np.array(self._x), self._p.copy()))
-        self.transitions.append(self._f.copy())
+        self.predicted.append(self._now())
+        self.transitions.append(self._f[:_KEPT, :_KEPT].copy())
         return gained
 
     def coast(self, t: float) -> None:
         """As the filter's; what is predicted over a gap is what is left after it."""
         super().coast(t)
-        self.predicted[-1] = np.array(self._x), self._p.copy()
+        self.predicted[-1] = self._now()
+
+    def _now(self) -> tuple[Floats, Floats]:
+        return np.array(self._x[:_KEPT]), self._p[:_KEPT, :_KEPT].copy()
 
     def smoothed(self) -> tuple[Floats, Floats]:
         """States (n + 1, 10) and covariances (n + 1, 10, 10) at the start and after each of n predictions."""
-        x, p = np.array(self._x), self._p.copy()
+        x, p = self._now()
         states, covariances = [x], [p]
         for index in range(len(self.transitions) - 1, -1, -1):
             x_then, p_then = self.corrected[index]

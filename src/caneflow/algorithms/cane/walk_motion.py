@@ -1,8 +1,9 @@
 """Velocity and position over ground in the gyro's frame: a Kalman filter on accelerometer, radar and gait.
 
-State x = (p_x, p_y, v_x, v_y, b_x, b_y, b_z, t_x, t_y, beta): position m and velocity m/s of the IMU's origin in the
-gyro's frame, bias of the accelerometer along the body's axes, m/s^2, what the chip's error of tilt makes of gravity,
-m/s^2 in the gyro's frame, and the angle by which the cane points to the right of where its bearer walks, rad.
+State x = (p_x, p_y, v_x, v_y, b_x, b_y, b_z, t_x, t_y, beta, m_x, m_y, n_x, n_y): position m and velocity m/s of the
+IMU's origin in the gyro's frame, bias of the accelerometer along the body's axes, m/s^2, what the chip's error of tilt
+makes of gravity, m/s^2 in the gyro's frame, the angle by which the cane points to the right of where its bearer walks,
+rad, and the position at the last mark and the one before, m, so that the way since then can be measured.
 
 Bias and tilt are two things: the bias turns with the cane and stays for a walk, the tilt errs in the world, for
 seconds. A corner turns the one by 90 deg and the other not at all.
@@ -24,9 +25,11 @@ from caneflow.algorithms.scalar_update import update
 
 Floats = NDArray[np.float64]
 
-_PX, _PY, _VX, _VY, _BX, _BY, _BZ, _TX, _TY, _BETA = range(10)
-STATES: Final = 10
+_PX, _PY, _VX, _VY, _BX, _BY, _BZ, _TX, _TY, _BETA, _MX, _MY, _NX, _NY = range(14)
+STATES: Final = 14
 _IDENTITY: Final = np.eye(STATES)
+_MARKED: Final = [*range(_MX), _PX, _PY, _MX, _MY]  # states that become the states when the position is marked
+_MARKED_BOTH: Final = np.ix_(_MARKED, _MARKED)
 
 # Body axes in the gyro's frame: the horizontal parts of x, y, z, as x + jy.
 Axes: TypeAlias = tuple[complex, complex, complex]
@@ -44,7 +47,7 @@ class WalkMotionSettings:
     tilt: Acceleration = 0.045  # m/s^2, sd of what 0.26 deg of tilt makes of gravity (cane.md)
     tilt_time: Time = 8.0  # s, over which it is correlated
     pointing: Angle = 0.06  # rad, sd of beta at the start
-    pointing_walk: Density | Zero = 0.01  # rad / sqrt(s): a wander of 1.5 deg over some steps
+    pointing_walk: Density | Zero = 0.005  # rad / sqrt(s): a wander of 1 deg over some steps
     outlier: Factor = 3.0  # sd, from which on a measurement counts as that far off and no farther
 
 
@@ -55,11 +58,23 @@ class WalkMotion:
         self._settings = settings
         self._x: list[float] = [0.0] * STATES
         s = settings
-        sd = (1e-6, 1e-6, s.velocity, s.velocity, s.bias, s.bias, s.bias, s.tilt, s.tilt, s.pointing)
+        sd = (1e-6, 1e-6, s.velocity, s.velocity, s.bias, s.bias, s.bias, s.tilt, s.tilt, s.pointing, *[1e-6] * 4)
         self._p: Floats = np.diag(np.square(sd))
         self._f: Floats = _IDENTITY.copy()
         accelerations, biases, tilts = s.acceleration_noise**2, s.bias_walk**2, 2.0 * s.tilt**2 / s.tilt_time
-        walks = (0.0, 0.0, accelerations, accelerations, biases, biases, biases, tilts, tilts, s.pointing_walk**2)
+        walks = (
+            0.0,
+            0.0,
+            accelerations,
+            accelerations,
+            biases,
+            biases,
+            biases,
+            tilts,
+            tilts,
+            s.pointing_walk**2,
+            *[0.0] * 4,
+        )
         self._noise_rates: Floats = np.array(walks)  # variances per s
 
     @property
@@ -109,7 +124,7 @@ class WalkMotion:
         f[_VX, _BX:_TY] = -t * a.real, -t * b.real, -t * c.real, -t
         f[_VY, _BX:_BETA] = -t * a.imag, -t * b.imag, -t * c.imag, 0.0, -t
         self._keep_tilt(t)
-        # 10 x 10 is below the size at which any BLAS takes more than one thread
+        # 14 x 14 is below the size at which any BLAS takes more than one thread
         self._p = f @ self._p @ f.T
         diagonal = self._p.reshape(-1)[:: STATES + 1]
         diagonal += self._noise_rates * t
@@ -163,12 +178,37 @@ class WalkMotion:
             ph += per_pointing * self._p[:, _BETA]
             expected += per_pointing * x[_BETA]
         spread = float(nx * ph[_VX] + ny * ph[_VY] + per_pointing * ph[_BETA]) + variance
-        innovation = value - expected
+        return self._correct(ph, value - expected, spread)
+
+    def observe_way(self, across: tuple[float, float], value: float, variance: float, *, per_pointing: float) -> float:
+        """Correct by the component `across` a direction of the way (m) since the mark before the last one.
+
+        Plus `per_pointing` times beta. Returns by how many standard deviations it was off.
+        """
+        (nx, ny), x, p = across, self._x, self._p
+        ph = nx * (p[:, _PX] - p[:, _NX]) + ny * (p[:, _PY] - p[:, _NY]) + per_pointing * p[:, _BETA]
+        expected = nx * (x[_PX] - x[_NX]) + ny * (x[_PY] - x[_NY]) + per_pointing * x[_BETA]
+        spread = float(nx * (ph[_PX] - ph[_NX]) + ny * (ph[_PY] - ph[_NY]) + per_pointing * ph[_BETA]) + variance
+        return self._correct(ph, value - expected, spread)
+
+    def mark(self) -> None:
+        """Remember the position, and forget the mark before the last one."""
+        self._x = [self._x[index] for index in _MARKED]
+        self._p = self._p[_MARKED_BOTH]
+
+    @property
+    def way(self) -> complex:
+        """The way since the mark before the last one, m, x + jy."""
+        x = self._x
+        return complex(x[_PX] - x[_NX], x[_PY] - x[_NY])
+
+    def _correct(self, across: Floats, innovation: float, spread: float) -> float:
+        """Kalman's correction; returns by how many standard deviations the innovation was off."""
         off = abs(innovation) / math.sqrt(spread)
         # an outlier is believed to be as uncertain as it is far off
         spread = max(spread, (innovation / self._settings.outlier) ** 2)
-        gain = update(self._p, ph, spread)
-        self._x = [a + g * innovation for a, g in zip(x, gain.tolist(), strict=True)]
+        gain = update(self._p, across, spread)
+        self._x = [a + g * innovation for a, g in zip(self._x, gain.tolist(), strict=True)]
         return off
 
     def doubt(self, speed: float, lasting: float) -> None:
