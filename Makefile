@@ -11,7 +11,7 @@ LOCK := $(if $(LOCKED),--constraint constraints.txt)
 # Flows are started by the hundred: each process would compile every module anew where this is set.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test lint lock docs soak bench real mcu-test clean
+.PHONY: run test lint lock docs compiled soak bench real mcu-test clean
 
 # The environment is made once, and again when the project's needs change. A dot every two seconds says that it goes on.
 define install
@@ -61,6 +61,11 @@ docs: $(BIN)/.installed
 	$(BIN)/python -m caneflow.messages.reference docs
 	$(BIN)/python -m caneflow.runtime.dataflow.yaml_reference docs
 	$(BIN)/sphinx-build --fail-on-warning --quiet docs build/site
+
+# The tests compiled once, for `.ci/run` beside the linters: on a clean clone each worker of `make test` would do it. What
+# cannot be compiled, `make test` says.
+compiled: $(BIN)/.installed
+	-@$(BIN)/pytest --collect-only --quiet >/dev/null
 
 # The long tests: every shared walk at real time and at full speed, calm and under load; kills, freezes, networks; fuzzing
 # with CANEFLOW_FUZZ_TIMES=100 times as many examples as in CI, CANEFLOW_SOAK_MINUTES of random kills. Property tests, the

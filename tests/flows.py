@@ -1,5 +1,6 @@
 """A cane that is spread over machines, a recording for it, and launchers to run it with: for several test files."""
 
+import io
 import itertools
 import os
 import re
@@ -10,13 +11,16 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout, suppress
+from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import psutil
 import pytest
 
+from caneflow import command, dispatch
 from caneflow.messages import Imu, RadarFrame, numbered, sample_key
 from caneflow.recording import Recording, RecordingWriter
 
@@ -81,6 +85,37 @@ def results(path: Path) -> dict[str, list[bytes]]:
             if sample.node in ("ground_speed", "fusion"):
                 found.setdefault(f"{sample.node}/{sample.port}", []).append(sample.payload)
         return found
+
+
+def caneflow(*args: object, cwd: Path | None = None) -> "subprocess.CompletedProcess[str]":
+    """The command, as a program: whatever starts processes, or is started."""
+    words = [*CANEFLOW, *map(str, args)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=180, check=False, cwd=cwd)
+
+
+def caneflow_here(*args: object, cwd: Path | None = None) -> "subprocess.CompletedProcess[str]":
+    """What a `caneflow` says that starts no processes, run in this one: an interpreter's start and imports less.
+
+    Where this process computes by other kernels than a program would (pytest without workers), it is a program.
+    """
+    if not _computes_as_a_program():
+        return caneflow(*args, cwd=cwd)
+    words = ["caneflow", *map(str, args)]
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        chdir(cwd or Path.cwd()),
+        patch.object(sys, "argv", words),
+        redirect_stdout(out),
+        redirect_stderr(err),
+        pytest.raises(SystemExit) as end,
+    ):
+        command.main()
+    return subprocess.CompletedProcess(words, int(end.value.code or 0), out.getvalue(), err.getvalue())
+
+
+@cache
+def _computes_as_a_program() -> bool:
+    return {"numpy", "mathematics"} <= set(dispatch.pinned())
 
 
 class Launched:

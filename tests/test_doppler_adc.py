@@ -39,6 +39,7 @@ from caneflow.runtime import Context, Quiet
 from caneflow.runtime.dataflow.programs import validated_settings
 from caneflow.runtime.errors import DataflowError
 from drivers import doppler_adc as driver
+from tests.flows import caneflow, caneflow_here
 from tools.import_wav import wav
 
 RATE = 4000
@@ -304,10 +305,11 @@ def test_a_flow_hears_the_same_from_a_file_and_from_its_recording(tmp_path: Path
     path, flow = written(tmp_path / "sound.wav", tone.astype(np.int16)[:, None]), tmp_path / "flow.yaml"
     flow.write_text(FLOW.format(flow="t" + tmp_path.name.replace("_", "")[-30:], sound=path))
     imported(path, "-o", tmp_path / "in.mcap")
-    for options in (["--record", "live.mcap"], ["--replay", "in.mcap", "--in-process", "--record", "replayed.mcap"]):
-        command = [sys.executable, "-m", "caneflow.command", "run", "flow.yaml", *options]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, done.stderr
+    done = caneflow("run", "flow.yaml", "--record", "live.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    replay = ("--replay", "in.mcap", "--in-process", "--record", "replayed.mcap")
+    done = caneflow_here("run", "flow.yaml", *replay, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
     live, replayed = targets(tmp_path / "live.mcap"), targets(tmp_path / "replayed.mcap")
     assert live == replayed
     speeds = [speed for speed, _, valid in live if valid]

@@ -17,7 +17,7 @@ import zenoh
 from caneflow.messages import Imu, control_key, decode
 from caneflow.messages.control import FlowStatus
 from caneflow.recording import Recording
-from tests.flows import CANEFLOW, Launched, free_port, launchers, wait_for
+from tests.flows import Launched, caneflow_here, free_port, launchers, wait_for
 
 FLOW = """
 flow: {flow}
@@ -156,10 +156,10 @@ def test_who_comes_by_tcp_writes_only_what_is_external(launch: Callable[..., Lau
 def test_where_nobody_listens_check_warns_and_a_live_run_says_what_to_write(tmp_path: Path) -> None:
     file = tmp_path / "flow.yaml"
     file.write_text(FLOW.format(flow="nobody"))
-    checked = subprocess.run([*CANEFLOW, "check", file], capture_output=True, text=True, check=False)
+    checked = caneflow_here("check", file)
     assert checked.returncode == 0
     assert "warning: nodes.imu: is a program of somebody else's, and this machine does not listen" in checked.stdout
-    run = subprocess.run([*CANEFLOW, "run", file], capture_output=True, text=True, check=False)
+    run = caneflow_here("run", file)
     assert run.returncode == 2
     assert "or give --listen tcp/127.0.0.1:7447" in run.stderr.splitlines()[-1]
     assert "Traceback" not in run.stderr
@@ -171,7 +171,7 @@ def test_a_port_that_is_taken_is_one_line_before_anything_starts(
     _, _, at = began(launch, tmp_path)
     file = tmp_path / "flow.yaml"
     file.write_text(FLOW.format(flow="second"))
-    run = subprocess.run([*CANEFLOW, "run", file, "--listen", at], capture_output=True, text=True, check=False)
+    run = caneflow_here("run", file, "--listen", at)
     assert run.returncode == 2
     assert at in run.stderr.splitlines()[-1]
     assert "Traceback" not in run.stderr

@@ -13,7 +13,7 @@ import pytest
 
 from caneflow.recording import Recording
 from caneflow.runtime.hosts.links.certificates import make_authority, make_certificate
-from tests.flows import CANEFLOW, NODES, Launched, launchers, results, spread_cane, wait_for, write_walk
+from tests.flows import NODES, Launched, caneflow_here, launchers, results, spread_cane, wait_for, write_walk
 from tests.networks import Faults, Network
 
 Launch = Callable[..., Launched]
@@ -38,8 +38,8 @@ def undisturbed(walk: Path) -> dict[str, list[bytes]]:
     """What one machine makes of the walk."""
     out, file = walk.with_name("undisturbed.mcap"), walk.with_name("one.yaml")
     file.write_text(spread_cane("one", "  here: {}\n", dict.fromkeys(NODES, "here")))
-    run = [*CANEFLOW, "run", str(file), "--replay", str(walk), "--in-process", "--record", str(out)]
-    subprocess.run(run, check=True, capture_output=True, timeout=90)
+    done = caneflow_here("run", file, "--replay", walk, "--in-process", "--record", out)
+    assert done.returncode == 0, done.stderr
     return results(out)
 
 
@@ -301,7 +301,5 @@ def test_a_live_run_goes_on_after_a_fault_and_its_recording_says_what_was_left_o
     log.info("%s: %d sent, %d of them counted", what, sent, counted)
     assert 200 < counted <= sent
     assert sent - counted < 100, "what was sent while the network was cut is sent again"
-    verified = subprocess.run(
-        [*CANEFLOW, "verify", str(hosts.file), str(hosts.out)], capture_output=True, text=True, check=False
-    )
+    verified = caneflow_here("verify", hosts.file, hosts.out)
     assert verified.returncode == 0, verified.stdout + verified.stderr

@@ -17,7 +17,7 @@ from caneflow.runtime.hosts.attached.asking import restarted
 from caneflow.runtime.hosts.attached.attach import attached, launchers_of, statuses
 from caneflow.runtime.replays.verification import verify
 from caneflow.runtime.stages.journal import Brought, Journal
-from tests.flows import NODES, launchers, node_processes, results, wait_for, write_walk
+from tests.flows import NODES, caneflow, caneflow_here, launchers, node_processes, results, wait_for, write_walk
 
 DEVICE = """
 import itertools, time
@@ -76,12 +76,12 @@ def grouped(path: Path, processes: Mapping[str, str], flow: str = "grouped") -> 
 def test_a_group_computes_the_same_bytes(tmp_path: Path, processes: Mapping[str, str]) -> None:
     walk, flow = write_walk(tmp_path / "walk.mcap", 200), grouped(tmp_path / "flow.yaml", processes)
     found = {}
-    with launchers() as launch:
-        for options in ("--in-process", "--speed=max"):
-            out = tmp_path / f"{options}.mcap"
-            launched = launch("run", flow, "--replay", walk, options, "--record", out, log=tmp_path / "log")
-            assert launched.ends() == 0, launched.said
-            found[options] = results(out)
+    for options in ("--in-process", "--speed=max"):
+        out = tmp_path / f"{options}.mcap"
+        run = caneflow_here if options == "--in-process" else caneflow
+        done = run("run", flow, "--replay", walk, options, "--record", out)
+        assert done.returncode == 0, done.stderr
+        found[options] = results(out)
     assert len(found["--in-process"]["fusion/pose"]) == 200
     assert found["--speed=max"] == found["--in-process"]
 
@@ -167,9 +167,9 @@ def test_a_group_in_a_replay_that_is_asked_to_restart_computes_the_same_bytes(tm
         grouped(tmp_path / "flow.yaml", dict.fromkeys(NODES, "cane"), "asked"),
     )
     alone, out = tmp_path / "alone.mcap", tmp_path / "out.mcap"
+    done = caneflow_here("run", flow, "--replay", walk, "--in-process", "--record", alone)
+    assert done.returncode == 0, done.stderr
     with launchers() as launch:
-        launched = launch("run", flow, "--replay", walk, "--in-process", "--record", alone, log=tmp_path / "log")
-        assert launched.ends() == 0, launched.said
         slowly = ("--speed", 0.4)  # the command must be through before the replay is
         launched = launch("run", flow, "--replay", walk, *slowly, "--record", out, log=tmp_path / "log")
         launched.wait_for("ready: 5 nodes")

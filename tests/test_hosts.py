@@ -1,7 +1,5 @@
 """One graph, two hosts: streams that end early, never start, lag, or are filtered give the same bytes in both."""
 
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,7 +9,7 @@ from caneflow.messages import Imu, decode, numbered, sample_key
 from caneflow.recording import Recording, RecordingWriter
 from caneflow.runtime.dataflow.loading import load
 from caneflow.runtime.deployment import deploy
-from tests.flows import NODES, spread_cane
+from tests.flows import NODES, caneflow, caneflow_here, spread_cane
 
 TICK = 10_000_000  # ns
 
@@ -141,10 +139,8 @@ def recorded(path: Path, stamps: Stamps) -> Path:
 
 
 def seen(flow: Path, recording: Path, out: Path, *options: str) -> list[bytes]:
-    command = [sys.executable, "-m", "caneflow.command", "run", str(flow), "--replay", str(recording)]
-    done = subprocess.run(
-        [*command, "--record", str(out), *options], capture_output=True, text=True, timeout=60, check=False
-    )
+    run = caneflow_here if "--in-process" in options else caneflow
+    done = run("run", flow, "--replay", recording, "--record", out, *options)
     assert done.returncode == 0, done.stderr
     with Recording(out) as got:
         return [sample.payload for sample in got.samples([("order", "seen")])]

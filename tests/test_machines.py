@@ -15,6 +15,7 @@ from tests.flows import (
     CANEFLOW,
     NODES,
     Launched,
+    caneflow_here,
     free_port,
     launchers,
     results,
@@ -57,7 +58,7 @@ def undisturbed(walk: Path) -> dict[str, list[bytes]]:
     out = walk.with_name("undisturbed.mcap")
     file = walk.with_name("one.yaml")
     file.write_text(spread_cane("one", "  here: {}\n", dict.fromkeys(NODES, "here")))
-    done = run("run", file, "--replay", walk, "--in-process", "--record", out)
+    done = caneflow_here("run", file, "--replay", walk, "--in-process", "--record", out)
     assert done.returncode == 0, done.stderr
     return results(out)
 

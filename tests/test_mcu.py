@@ -40,6 +40,7 @@ from caneflow.recording import Recording
 from caneflow.runtime import Context
 from caneflow.simulation.scenario import simulate_walk
 from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings
+from tests.flows import caneflow, caneflow_here
 from tools import mcu
 
 ROOT = Path(__file__).parents[1]
@@ -78,8 +79,7 @@ def flow(tmp_path: Path) -> Path:
 
 def test_the_header_has_the_constants_of_the_model(tmp_path: Path) -> None:
     output = tmp_path / "observer_config.h"
-    command = [*CANEFLOW, "mcu", "config", str(ROOT / "dataflow.yaml"), "-o", str(output)]
-    subprocess.run(command, check=True, timeout=60)
+    assert caneflow_here("mcu", "config", ROOT / "dataflow.yaml", "-o", output).returncode == 0
     constants = observer_constants(LuenbergerSettings(), BORESIGHT)
     found = defined(output.read_text())
     assert found["DIGEST"] == constants.digest
@@ -635,9 +635,9 @@ def emulated_port(firmware: Path) -> Iterator[str]:
 
 def run(flow: str, recording: Path, out: Path, *options: str) -> list[bytes]:
     """The poses of a replay of 1.2 s of walking."""
-    command = [*CANEFLOW, "run", str(ROOT / flow), "--replay", str(recording), "--record", str(out), *options]
-    part = ["--start", "2.6", "--duration", "1.2"]
-    done = subprocess.run([*command, *part], capture_output=True, text=True, timeout=180, check=False)
+    run = caneflow_here if "--in-process" in options else caneflow
+    part = ("--start", "2.6", "--duration", "1.2")
+    done = run("run", ROOT / flow, "--replay", recording, "--record", out, *options, *part)
     assert done.returncode == 0, done.stderr
     with Recording(out) as recorded:
         return [sample.payload for sample in recorded.samples([("fusion", "pose")])]
@@ -649,8 +649,8 @@ def test_a_replay_through_the_emulated_microcontroller_gives_the_bytes_of_one_in
 ) -> None:
     pytest.importorskip("serial", reason="pyserial is not here; it comes with caneflow[devices]")
     recording = tmp_path / "walk.mcap"
-    simulate = [*CANEFLOW, "simulate", "walk", "--scenario", "straight", "--duration", "4", "-o", str(recording)]
-    subprocess.run(simulate, check=True, capture_output=True, timeout=60)
+    simulated = caneflow_here("simulate", "walk", "--scenario", "straight", "--duration", 4, "-o", recording)
+    assert simulated.returncode == 0, simulated.stderr
     expected = run(
         "dataflow.yaml", recording, tmp_path / "model.mcap", "--in-process", "--set", f"fusion.method={METHOD}"
     )

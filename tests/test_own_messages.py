@@ -3,7 +3,6 @@
 import importlib
 import json
 import re
-import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ from caneflow.runtime.plan import InputPlan
 from caneflow.runtime.stages.snapshot import pack, unpack
 from caneflow.runtime.user_files import kind_at, module_of, place_of
 from caneflow.viewing.live import LiveStreams
-from tests.flows import CANEFLOW
+from tests.flows import caneflow, caneflow_here
 from tools.echo import told
 
 STEP = 10_000_000  # ns
@@ -102,10 +101,10 @@ def forgotten_afterwards(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             del table[name]
 
 
-def caneflow(project: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run([*CANEFLOW, *map(str, arguments)], cwd=project, capture_output=True, text=True, check=False)
-    assert "Traceback" not in done.stderr
-    return done
+def said(project: Path, *arguments: object) -> str:
+    done = caneflow_here(*arguments, cwd=project)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
 
 
 def recorded(path: Path) -> dict[str, tuple[str, dict[str, object], list[bytes]]]:
@@ -120,7 +119,8 @@ def recorded(path: Path) -> dict[str, tuple[str, dict[str, object], list[bytes]]
 
 
 def run(project: Path, name: str, *options: object) -> dict[str, tuple[str, dict[str, object], list[bytes]]]:
-    done = caneflow(project, "run", "own.yaml", "--replay", "still.mcap", "--record", name, *options)
+    done = caneflow("run", "own.yaml", "--replay", "still.mcap", "--record", name, *options, cwd=project)
+    assert "Traceback" not in done.stderr
     assert done.returncode == 0, done.stderr
     return recorded(project / name)
 
@@ -135,18 +135,17 @@ def test_every_host_carries_it_and_records_it_under_its_schema(project: Path) ->
     assert [msgpack.unpackb(payload) for payload in payloads] == [
         {"stamp": seq * STEP, "seq": seq, "distance": 5.0, "name": "twice"} for seq in range(SAMPLES)
     ]
-    verified = caneflow(project, "verify", "own.yaml", "spread.mcap")
-    assert f"doubler/range: {SAMPLES} of {SAMPLES} samples equal in every byte" in verified.stdout, verified.stderr
+    verified = said(project, "verify", "own.yaml", "spread.mcap")
+    assert f"doubler/range: {SAMPLES} of {SAMPLES} samples equal in every byte" in verified
 
 
 def test_who_does_not_know_the_type_shows_its_fields(project: Path) -> None:
     """Those that the wire leaves out, as they are the default, are in the recorded JSON Schema."""
     run(project, "out.mcap", "--in-process")
-    info = caneflow(project, "info", "out.mcap")
-    assert re.search(rf"^ranger/range +mine\.Range/1 +{SAMPLES} ", info.stdout, re.MULTILINE)
-    table = caneflow(project, "export", "out.mcap", "--format", "csv", "--stream", "ranger/range")
-    assert table.stderr == ""
-    assert table.stdout.splitlines()[:3] == [
+    assert "mine.Range/1" not in registry.SAMPLES, "nobody here knows it"
+    assert re.search(rf"^ranger/range +mine\.Range/1 +{SAMPLES} ", said(project, "info", "out.mcap"), re.MULTILINE)
+    table = said(project, "export", "out.mcap", "--format", "csv", "--stream", "ranger/range")
+    assert table.splitlines()[:3] == [
         "stamp,seq,distance,name",
         "0,0,2.5,front",
         f"{STEP},1,2.5,front",
@@ -156,10 +155,10 @@ def test_who_does_not_know_the_type_shows_its_fields(project: Path) -> None:
             export_parquet(recording, recording.stream("ranger", "range"), project / "range.parquet")
             rows = importlib.import_module("polars").read_parquet(project / "range.parquet")
             assert rows.row(1) == (STEP, 1, 2.5, "front")
-    schema = caneflow(project, "schema", "ranges.py:Range").stdout
-    assert schema == caneflow(project, "schema", "out.mcap:mine.Range/1").stdout
+    schema = said(project, "schema", "out.mcap:mine.Range/1")
     assert json.loads(schema) == recorded(project / "out.mcap")["own/ranger/range"][1]
-    assert set(json.loads(caneflow(project, "schema", "own.yaml").stdout)) == {"caneflow.Imu/1", "mine.Range/1"}
+    assert schema == said(project, "schema", "ranges.py:Range")
+    assert set(json.loads(said(project, "schema", "own.yaml"))) == {"caneflow.Imu/1", "mine.Range/1"}
 
 
 def test_an_external_node_may_send_it_and_a_recording_stands_in_for_that(project: Path) -> None:
@@ -171,7 +170,7 @@ def test_an_external_node_may_send_it_and_a_recording_stands_in_for_that(project
         graph, _ = examine(project / "own.yaml")
         assert graph is not None
         assert graph.nodes["ranger"].outputs["range"].schema == "mine.Range/1"
-    done = caneflow(project, "run", "own.yaml", "--replay", "whole.mcap", "--record", "part.mcap", "--speed", "max")
+    done = caneflow("run", "own.yaml", "--replay", "whole.mcap", "--record", "part.mcap", "--speed", "max", cwd=project)
     assert done.returncode == 0, done.stderr
     part = recorded(project / "part.mcap")
     assert part == {key: whole[key] for key in ("own/ranger/range", "own/doubler/range")}

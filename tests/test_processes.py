@@ -20,7 +20,7 @@ from caneflow.messages.control import Counters
 from caneflow.recording import Recording
 from caneflow.runtime.hosts.launcher.run_directory import running_flows
 from caneflow.runtime.hosts.links.session import open_session
-from tests.flows import BOTH_LINKS, node_processes, write_walk
+from tests.flows import BOTH_LINKS, caneflow, caneflow_here, node_processes, write_walk
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -122,10 +122,6 @@ def live(tmp_path: Path, flow: str, links: str) -> Path:
     return path
 
 
-def caneflow(*args: object) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run([*CANEFLOW, *map(str, args)], capture_output=True, text=True, timeout=90, check=False)
-
-
 class Running:
     """A flow that was started and goes on."""
 
@@ -210,13 +206,13 @@ def counters(session: zenoh.Session, flow: str, node: str) -> "Iterator[Counters
 
 def test_every_host_and_speed_gives_the_same_bytes(cane: Path, walk: Path, tmp_path: Path) -> None:
     outputs = {}
-    for name, options in {
-        "max": ["--speed", "max"],
-        "paced": ["--speed", "2"],
-        "in_process": ["--in-process"],
-    }.items():
+    for name, how, options in [
+        ("max", caneflow, ["--speed", "max"]),
+        ("paced", caneflow, ["--speed", "2"]),
+        ("in_process", caneflow_here, ["--in-process"]),
+    ]:
         out = tmp_path / f"{name}.mcap"
-        done = caneflow("run", cane, "--replay", walk, *options, "--record", out)
+        done = how("run", cane, "--replay", walk, *options, "--record", out)
         assert done.returncode == 0, done.stderr
         outputs[name] = results(out)
     assert {stream: len(payloads) for stream, payloads in outputs["max"].items()} == {
@@ -488,7 +484,7 @@ def test_a_node_that_hangs_before_it_is_ready_is_named(
 
 def test_a_missing_program_is_found_before_anything_starts(live: Path, tmp_path: Path) -> None:
     (tmp_path / "echo.py").unlink()
-    done = caneflow("run", live)
+    done = caneflow_here("run", live)
     assert done.returncode == 2
     assert re.search(r"live\.yaml:5:\d+: nodes\.echo\.run: no Python file '.*echo\.py'", done.stderr)
     assert "Traceback" not in done.stderr
@@ -566,12 +562,12 @@ def test_an_unfit_recording_is_refused_in_one_line(cane: Path, walk: Path, tmp_p
     cane.write_text(
         text.replace("imu: {run: drivers.bno055}", "belt: {run: drivers.bno055}").replace("imu/imu", "belt/imu")
     )
-    done = caneflow("run", cane, "--replay", walk)
+    done = caneflow_here("run", cane, "--replay", walk)
     assert done.returncode == 2
     assert "no stream belt/imu; it holds imu/imu, radar/frame" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     cane.write_text(text)
-    done = caneflow("run", cane, "--replay", tmp_path / "nowhere.mcap")
+    done = caneflow_here("run", cane, "--replay", tmp_path / "nowhere.mcap")
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
 
@@ -654,7 +650,7 @@ def test_a_live_run_goes_on_without_what_lags_and_its_recording_knows(
     assert status == 130, output
     with Recording(out) as recording:
         assert recording.control[control_key(flow, "late")] > 20
-    done = caneflow("verify", file, out)
+    done = caneflow_here("verify", file, out)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "samples equal in every byte" in done.stdout
 
@@ -684,29 +680,29 @@ def test_verify_writes_nothing(cane: Path, walk: Path, tmp_path: Path) -> None:
         cane.read_text().replace("nodes:\n", "nodes:\n  writes: {run: ./writes.py, inputs: {pose: fusion/pose}}\n")
     )
     out, written = tmp_path / "out.mcap", tmp_path / "writes.txt"
-    done = caneflow("run", cane, "--replay", walk, "--in-process", "--record", out)
+    done = caneflow_here("run", cane, "--replay", walk, "--in-process", "--record", out)
     assert done.returncode == 0, done.stderr
     written.unlink()
-    done = caneflow("verify", cane, out)
+    done = caneflow_here("verify", cane, out)
     assert done.returncode == 0, done.stderr
     assert not written.exists()
 
 
 def test_verify_names_the_first_difference(cane: Path, walk: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    done = caneflow("run", cane, "--replay", walk, "--in-process", "--record", out)
+    done = caneflow_here("run", cane, "--replay", walk, "--in-process", "--record", out)
     assert done.returncode == 0, done.stderr
     other = ["--set", "fusion.luenberger.pole_acceleration=0.500001"]
-    done = caneflow("verify", cane, out, *other)
+    done = caneflow_here("verify", cane, out, *other)
     assert done.returncode == 1
     assert "ground_speed/speed: 400 of 400 samples equal in every byte" in done.stdout
     assert re.search(
         r"fusion/pose: differs at seq \d+ \(stamp \d+\): (position|velocity) was \(.*\), is \(", done.stdout
     )
-    done = caneflow("verify", cane, out, *other, "--tolerance", "0.01")
+    done = caneflow_here("verify", cane, out, *other, "--tolerance", "0.01")
     assert done.returncode == 0, done.stdout
     assert "within the tolerance (largest " in done.stdout
-    done = caneflow("verify", cane, walk)
+    done = caneflow_here("verify", cane, walk)
     assert done.returncode == 2
     assert "holds no output of" in done.stderr
 
@@ -731,5 +727,5 @@ def test_a_killed_node_goes_on_as_if_nothing_had_happened(
     assert running.process.returncode == 0, output
     assert f"{victim} | ended with killed by SIGKILL; restart 1 of" in output
     undisturbed = tmp_path / "undisturbed.mcap"
-    assert caneflow("run", cane, "--replay", walk, "--in-process", "--record", undisturbed).returncode == 0
+    assert caneflow_here("run", cane, "--replay", walk, "--in-process", "--record", undisturbed).returncode == 0
     assert results(out) == results(undisturbed)

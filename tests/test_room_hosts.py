@@ -1,13 +1,12 @@
 """The room's graphs in both hosts: the same recording gives the same bytes, particles and all."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from caneflow.recording import Recording
 from caneflow.simulation.room_scenario import Reflections, RoomSettings, simulate_room
+from tests.flows import caneflow, caneflow_here
 from tools.simulate import room_samples, written
 
 ROOT = Path(__file__).parents[1]
@@ -25,10 +24,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def poses(walk: Path, out: Path, method: str, *options: str) -> list[bytes]:
-    command = [sys.executable, "-m", "caneflow.command", "run", str(ROOT / "dataflows" / "room.yaml")]
-    part = ["--replay", str(walk), "--duration", "6"]
-    chosen = [*part, "--record", str(out), "--set", f"room_tracker.method={method}", *options]
-    done = subprocess.run([*command, *chosen], capture_output=True, text=True, timeout=100, check=False, cwd=ROOT)
+    run = caneflow_here if "--in-process" in options else caneflow
+    part, chosen = ("--replay", walk, "--duration", 6), ("--set", f"room_tracker.method={method}")
+    done = run("run", ROOT / "dataflows" / "room.yaml", *part, "--record", out, *chosen, *options)
     assert done.returncode == 0, done.stderr
     with Recording(out) as got:
         return [sample.payload for sample in got.samples([POSES])]

@@ -446,7 +446,10 @@ def reference(case: str) -> dict[str, Path]:
     return paths
 
 
-@pytest.mark.parametrize(("case", "limit"), [("nominal_real2_circle_0", 0.6), ("nominal_iq2_circle_0", 0.5)])
+@pytest.mark.parametrize(
+    ("case", "limit"),
+    [("nominal_real2_circle_0", 0.6), pytest.param("nominal_iq2_circle_0", 0.5, marks=pytest.mark.long)],
+)
 def test_a_reference_room_is_calibrated_and_tracked(
     case: str, limit: float, tmp_path: Path, caneflow: Callable[..., Run]
 ) -> None:
@@ -455,7 +458,7 @@ def test_a_reference_room_is_calibrated_and_tracked(
     assert status == 0
     assert "south" in said
     flow = ROOT / "dataflows" / "room.yaml"
-    replay = ("--replay", paths[""], "--duration", 25, "--in-process")
+    replay = ("--replay", paths[""], "--duration", 15, "--in-process")
     assert caneflow("run", flow, *replay, "--rig", rig, "--record", out)[0] == 0
     assert mean_error(paths[""], out) < limit
 

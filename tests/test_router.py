@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +15,16 @@ from caneflow.runtime.dataflow.loading import examine
 from caneflow.runtime.hosts.attached.attach import link_settings
 from caneflow.runtime.hosts.links.certificates import make_authority, make_certificate
 from caneflow.runtime.hosts.links.session import open_session
-from tests.flows import CANEFLOW, Launched, free_port, launchers, results, spread_cane, wait_for, write_walk
+from tests.flows import (
+    Launched,
+    caneflow_here,
+    free_port,
+    launchers,
+    results,
+    spread_cane,
+    wait_for,
+    write_walk,
+)
 
 Launch = Callable[..., Launched]
 SPLIT = {"imu": "gateway", "radar": "gateway", "ground_speed": "gateway", "fusion": "phone"}
@@ -64,8 +72,8 @@ def replay_on_both(launch: Launch, file: Path, tmp_path: Path) -> None:
     """Replay a walk on both machines, and compare what each recorded with the run on one."""
     walk = write_walk(tmp_path / "walk.mcap")
     alone = tmp_path / "alone.mcap"
-    done = launch("run", file, "--replay", walk, "--in-process", "--record", alone, log=tmp_path / "alone.log")
-    assert done.ends() == 0, done.said
+    done = caneflow_here("run", file, "--replay", walk, "--in-process", "--record", alone)
+    assert done.returncode == 0, done.stderr
     started = {
         machine: launch(
             *("run", file, "--machine", machine, "--replay", walk, "--speed", "max"),
@@ -96,9 +104,9 @@ def keys(file: Path) -> Path:
 
 def secured(file: Path) -> zenoh.Config:
     """The configuration that `caneflow keys router` prints, on this computer only."""
-    command = [*CANEFLOW, "keys", "router", str(file), "--keys", str(file.parent / "keys")]
-    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return zenoh.Config.from_json5(said.replace("[::]", "127.0.0.1"))
+    done = caneflow_here("keys", "router", file, "--keys", file.parent / "keys")
+    assert done.returncode == 0, done.stderr
+    return zenoh.Config.from_json5(done.stdout.replace("[::]", "127.0.0.1"))
 
 
 def test_the_same_with_keys(launch: Launch, file: Path, keys: Path, tmp_path: Path) -> None:

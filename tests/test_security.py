@@ -22,7 +22,7 @@ from caneflow.runtime.hosts.launcher.run_directory import running_flows
 from caneflow.runtime.hosts.links.access import access_control, check_access_control, machine_grants
 from caneflow.runtime.hosts.links.certificates import certificates, credentials, make_authority, make_certificate
 from caneflow.runtime.hosts.links.session import open_session
-from tests.flows import CANEFLOW, Launched, free_port, launchers, spread_cane, wait_for
+from tests.flows import Launched, caneflow_here, free_port, launchers, spread_cane, wait_for
 
 DATAFLOWS = Path(__file__).parents[1] / "dataflows"
 SPLIT = {"imu": "gateway", "radar": "gateway", "ground_speed": "gateway", "fusion": "phone"}
@@ -72,7 +72,7 @@ def test_keys_are_for_their_owner_only(keys: Path) -> None:
 
 def test_the_command_makes_and_lists_keys(tmp_path: Path) -> None:
     def caneflow(*args: str) -> "subprocess.CompletedProcess[str]":
-        return subprocess.run([*CANEFLOW, "keys", *args], cwd=tmp_path, capture_output=True, text=True, check=False)
+        return caneflow_here("keys", *args, cwd=tmp_path)
 
     assert caneflow("add", "gateway").returncode == 2
     assert caneflow("init").returncode == 0
@@ -229,9 +229,7 @@ def test_nothing_listens_beyond_this_computer_without_keys(tmp_path: Path) -> No
     file = tmp_path / "flow.yaml"
     file.write_text(spread_cane("cane", machines(host="0.0.0.0"), SPLIT))  # noqa: S104 - is refused
 
-    done = subprocess.run(
-        [*CANEFLOW, "run", str(file), "--machine", "gateway"], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = caneflow_here("run", file, "--machine", "gateway")
 
     assert done.returncode == 2
     assert "gateway: no keys for tcp/0.0.0.0:7447 in" in done.stderr
@@ -251,13 +249,7 @@ def test_recording_with_keys_has_to_be_allowed(tmp_path: Path, keys: Path) -> No
     file = tmp_path / "flow.yaml"
     file.write_text(spread_cane("cane", machines(free_port()), SPLIT))
 
-    done = subprocess.run(
-        [*CANEFLOW, "run", file, "--machine", "gateway", "--keys", keys, "--record", tmp_path / "out.mcap"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = caneflow_here("run", file, "--machine", "gateway", "--keys", keys, "--record", tmp_path / "out.mcap")
 
     assert done.returncode == 2
     assert "gateway may not read every stream; write machines.gateway.records" in done.stderr

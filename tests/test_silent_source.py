@@ -4,7 +4,6 @@ import os
 import queue
 import re
 import signal
-import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,7 @@ from caneflow.runtime import Brought, Quiet, Source
 from caneflow.runtime.hosts.process.events import Confirmed, Event, HistoryAsked, Started
 from caneflow.runtime.hosts.process.sources import SourceProcess
 from caneflow.runtime.plan import NodePlan, OutputPlan, ProcessPlan
-from tests.flows import CANEFLOW, launchers, node_processes, wait_for
+from tests.flows import caneflow_here, launchers, node_processes, wait_for
 
 OUTPUT = OutputPlan(key="f/imu/imu", schema="caneflow.Imu/1", readers=("reader",))
 PLAN = ProcessPlan.of(NodePlan(flow="f", node="imu", outputs={"imu": OUTPUT}))
@@ -167,5 +166,5 @@ def test_an_operator_that_is_killed_in_the_silence_of_its_source_loses_nothing(t
     with Recording(out) as recording:
         counted = [decode(sample.payload, Imu).gyro[0] for sample in recording.samples([("count", "imu")])]
     assert counted == [float(number) for number in range(1, 301)]
-    verified = subprocess.run([*CANEFLOW, "verify", str(file), str(out)], capture_output=True, text=True, check=False)
+    verified = caneflow_here("verify", file, out)
     assert verified.returncode == 0, verified.stdout + verified.stderr

@@ -1,8 +1,6 @@
 """`caneflow eval --methods smoothed`: a recording in hindsight, through the graph, against `best` and by order."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import msgspec
@@ -18,6 +16,7 @@ from caneflow.runtime.errors import DataflowError
 from caneflow.runtime.program import Context
 from caneflow.runtime.replays.evaluation import chosen_methods, offered_methods
 from caneflow.runtime.replays.smoothed_method import smoothed_poses, smoother
+from tests.flows import caneflow_here
 from tools import simulate
 
 ROOT = Path(__file__).parents[1]
@@ -34,10 +33,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_hindsight_is_closer_on_the_way_than_best(walk: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "caneflow.command", "eval", walk, "--methods", "best,smoothed", "--json"],
-        cwd=ROOT, check=True, capture_output=True, text=True,
-    )  # fmt: skip
+    done = caneflow_here("eval", walk, "--methods", "best,smoothed", "--json", cwd=ROOT)
+    assert done.returncode == 0, done.stderr
     by_method = json.loads(done.stdout)
     (best,), (smoothed,) = (list(by_method[name].values()) for name in ("best", "smoothed"))
     assert smoothed["poses"] == best["poses"]

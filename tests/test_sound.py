@@ -22,7 +22,7 @@ from caneflow.recording import RecordingWriter
 from caneflow.runtime import Context
 from caneflow.runtime.errors import DataflowError
 from drivers.sound import CueLog, CueSound, Player, SoundSettings, hearing_of
-from tests.flows import launchers, node_processes, wait_for
+from tests.flows import caneflow_here, launchers, node_processes, wait_for
 
 SECOND = 1_000_000_000
 FLOW = """
@@ -131,16 +131,16 @@ def test_processes_a_kill_and_one_process_give_the_same_bytes(tmp_path: Path) ->
     for file in ("one", "many"):
         (tmp_path / f"{file}.yaml").write_text(FLOW.format(flow=name, file=tmp_path / f"{file}.wav"))
     with launchers() as launch:
-        one = launch("run", tmp_path / "one.yaml", "--replay", recording, "--in-process", log=tmp_path / "one.log")
-        assert one.ends() == 0, one.said
+        one = caneflow_here("run", tmp_path / "one.yaml", "--replay", recording, "--in-process")
+        assert one.returncode == 0, one.stderr
         many = launch("run", tmp_path / "many.yaml", "--replay", recording, "--speed", 4, log=tmp_path / "many.log")
         log = tmp_path / "many.wav.cues"
         wait_for(lambda: log.exists() and log.stat().st_size > 2000, "some cues")
         node_processes(many.process.pid)["sound"].send_signal(signal.SIGKILL)
         assert many.ends() == 0, many.said
-        again = launch("run", tmp_path / "one.yaml", "--replay", recording, "--in-process", log=tmp_path / "again.log")
-        assert again.ends() == 2, again.said
-        assert "one.wav: already exists" in again.said
+        again = caneflow_here("run", tmp_path / "one.yaml", "--replay", recording, "--in-process")
+        assert again.returncode == 2, again.stderr
+        assert "one.wav: already exists" in again.stderr
     assert (tmp_path / "many.wav").read_bytes() == (tmp_path / "one.wav").read_bytes()
 
 

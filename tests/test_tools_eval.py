@@ -30,6 +30,7 @@ from caneflow.runtime.replays.evaluation import (
 )
 from caneflow.runtime.replays.results_file import ResultsFile
 from caneflow.runtime.replays.workers import mapped_on_cluster
+from tests.flows import caneflow_here
 from tools import evaluate, simulate
 
 ROOT = Path(__file__).parents[1]
@@ -39,8 +40,7 @@ METHODS = offered_methods(load(FLOW))
 
 
 def caneflow(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "caneflow.command", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    return caneflow_here(*arguments, cwd=ROOT)
 
 
 @pytest.fixture(scope="module")
