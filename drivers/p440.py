@@ -358,12 +358,16 @@ class Framing:
             yield self._frame(stamp, one, period)
 
     def _measure(self, stamp: int, scan: Scan) -> None:
-        """Take the carrier from the scans, once; a setting overrides."""
+        """Take the carrier from the scans until it is settled; a setting overrides."""
         found = self._meter.update(1e-9 * stamp, scan.samples, scan.range_step) if self._meter else None
         if found is None:
             return
-        self._meter, self._carrier = None, found.carrier
+        self._carrier = found.carrier
         giga = [value / 1e9 for value in (found.carrier, found.error, found.spread)]
+        if found.by_centroid:
+            log.info("carrier %.3f +- %.3f GHz, the centroid of what moves; its phase has not settled yet", *giga[:2])
+            return
+        self._meter = None
         log.info("carrier %.3f +- %.3f GHz, measured on %d echoes (sd %.3f)", *giga[:2], found.echoes, giga[2])
 
     def _frame(self, stamp: int, scan: Scan, period: float) -> RadarFrame:

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from caneflow.algorithms.radar.received_carrier import WINDOW, ReceivedCarrier, received_carrier
+from caneflow.algorithms.radar.received_carrier import WINDOW, ReceivedCarrier, centroid_carrier, received_carrier
 from caneflow.errors import CaneflowError
 from caneflow.messages import NAME, NAME_RULE, RadarFrame, numbered, sample_key
 from caneflow.options import Overwrite
@@ -119,19 +119,26 @@ def scan_period(stamps: Sequence[int]) -> float:
 
 
 def _measured_carrier(scans: Sequence[Scan], stamps: Sequence[int]) -> ReceivedCarrier | None:
-    """From the scans that have the shape of the first; None where nothing moves enough."""
+    """From the scans that have the shape of the first: by phase where that settles; None where nothing moves enough."""
     shape = (scans[0].scan_start_ps, len(scans[0].samples))
     alike = [index for index, scan in enumerate(scans) if (scan.scan_start_ps, len(scan.samples)) == shape]
     samples = np.stack([scans[index].samples for index in alike]).astype(np.float32)
     times = np.array([stamps[index] for index in alike]) / 1e9
     hop = max(len(alike) // MEASURED_WINDOWS, WINDOW // 4)
-    return received_carrier(samples, times, scans[0].range_step, hop=hop)
+    by_phase = received_carrier(samples, times, scans[0].range_step, hop=hop)
+    if by_phase is not None and by_phase.settled:
+        return by_phase
+    return centroid_carrier(samples, scans[0].range_step, hop=hop) or by_phase
 
 
 def _carrier_line(measured: ReceivedCarrier | None) -> str:
     if measured is None:
         return f"carrier: {NOMINAL_CARRIER / 1e9:g} GHz, the nominal one: too little moves to measure it; see --carrier"
     giga = [value / 1e9 for value in (measured.carrier, measured.error, measured.spread)]
+    if measured.by_centroid:
+        return (
+            f"carrier: {giga[0]:.3f} +- {giga[1]:.3f} GHz, centroid of what changes: no single echoes to measure it on"
+        )
     return (
         f"carrier: {giga[0]:.3f} +- {giga[1]:.3f} GHz, measured on {measured.echoes} moving echoes (sd {giga[2]:.3f})"
     )
