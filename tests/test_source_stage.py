@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from caneflow.messages import Imu
+from caneflow.messages import Imu, decode
 from caneflow.messages.control import PortMark
 from caneflow.runtime.hosts.process import present
 from caneflow.runtime.hosts.process.present import Present
@@ -85,3 +85,14 @@ def test_the_present_is_the_machines_clock() -> None:
     here = Present()
     before = time.time_ns()
     assert before <= here.now() <= time.time_ns() + SECOND
+
+
+def test_after_a_resume_outputs_go_on_in_number_and_time() -> None:
+    before, after = feed(), feed()
+    before.take("imu", imu(NOW))
+    after.resume(before.state())
+    assert after.take("imu", imu(NOW)) is None
+    assert after.unsent == {"imu": 1}
+    payload = after.take("imu", imu(NOW + 1))
+    assert payload is not None
+    assert decode(payload, Imu).seq == 1
