@@ -61,7 +61,7 @@ def test_what_a_sensor_would_see_changes_with_the_state_as_its_derivative_says(w
 
 
 def test_an_antenna_that_goes_round_the_imu_moves_nobody() -> None:
-    """On the spot at 60 deg/s, the antenna 0.3 m to the right of the boresight: it goes at 0.31 m/s, the IMU does not."""
+    """On the spot at 60 deg/s, the antenna 0.3 m right of the boresight: it goes at 0.31 m/s, the IMU at none."""
     antenna, rate = (0.3, 0.0, 0.0), math.radians(60)
     settings = CaneFilterSettings(hand_ahead=0.0)  # the hand stays where it is as well
     cane = CaneFilter(settings, boresight=(0.0, 1.0, 0.0), pivot=(0.0, 0.0, 0.0), antenna=antenna)

@@ -1,4 +1,4 @@
-"""A sink behind its streams: what is missing, comes again or cannot be read is told apart; it goes on after a resume."""
+"""A sink behind its streams: what is missing, repeated or unreadable is told apart; it goes on after a resume."""
 
 from caneflow.messages import Imu, MessageError, Sample
 from caneflow.messages.control import PortMark
