@@ -27,6 +27,8 @@ CONTINUOUS_NS: Final = 32_000  # ns added to a sweep in continuous sweep mode
 EXTRA_SAMPLES: Final = 3  # of a sweep, without points
 OUTLIER: Final = 8.0  # times the median of the second differences along sweeps, beyond which a sample is disturbed
 FEWEST_SWEEPS: Final = 32  # of a frame, for the median to mean something: the vendor's filter needs as many
+HEADERS: Final = 15e3  # bytes per second of a link that frames' own lines take
+UART_BITS: Final = 10  # of a byte
 
 
 class Profile(NamedTuple):
@@ -120,6 +122,32 @@ class RangeAxis(NamedTuple):
 
     start: float  # m, of the first
     step: float  # m from one to the next
+
+
+def setup_fault(setup: SweepSetup, baud: int | None) -> str | None:
+    """Why a radar on a UART of `baud` bit/s (None: another link) cannot measure so, in m, Hz and kB/s; None: it can."""
+    last = (setup.start_point + (setup.points - 1) * setup.step_length) * BASE_STEP
+    repetition = REPETITIONS[setup.repetition]
+    if setup.repetition == "19_5_MHz" and setup.profile != 1:
+        return f"prf is 19_5_MHz with profile {setup.profile}; it needs profile 1"
+    if last > repetition.farthest:
+        return f"end is {last:.2f} m; at prf {setup.repetition} the radar measures to {repetition.farthest:g} m"
+    size = setup.points * setup.sweeps
+    if size > BUFFER_POINTS:
+        return f"{setup.points} points x {setup.sweeps} sweeps are {size}; the radar's buffer holds {BUFFER_POINTS}"
+    fastest = 1.0 / setup.sweep_time
+    if setup.sweep_rate > fastest:
+        return (
+            f"sweep_rate is {setup.sweep_rate:g} Hz; {setup.points} points of profile {setup.profile} and hwaas "
+            f"{setup.averages} take {1e3 * setup.sweep_time:.3f} ms, {fastest:.0f} Hz at most"
+        )
+    capacity = math.inf if baud is None else baud / UART_BITS - HEADERS
+    if setup.link_rate > capacity:
+        return (
+            f"{setup.points} points at {setup.sweep_rate:g} Hz are {setup.link_rate / 1e3:.0f} kB/s; a UART of {baud} "
+            f"bit/s carries {max(capacity, 0.0) / 1e3:.0f} kB/s of samples"
+        )
+    return None
 
 
 def range_axis(start_point: int, step_length: int, base_step: float = BASE_STEP) -> RangeAxis:
