@@ -349,7 +349,7 @@ def test_a_radar_that_moves_sideways_is_believed_less() -> None:
                 cane.velocity(stamp_ns, (0.0, 0.0001), (0.04, 0.0, UNOBSERVED), 0.0)
         assert estimate.covariance is not None
         ahead = np.array([math.cos(rate * 0.11), math.sin(rate * 0.11)])
-        variance = float(ahead @ estimate.covariance[3:5, 3:5] @ ahead) / settings.covariance_share
+        variance = float(ahead @ estimate.covariance[3:5, 3:5] @ ahead)
         variances.append(1.0 / (1.0 / variance - 1.0))
     assert variances[0] == pytest.approx(0.08, rel=0.05)
     assert variances[1] == pytest.approx(0.08 + (0.14 * 2.0 * math.cos(PITCH)) ** 2, rel=0.05)

@@ -71,8 +71,6 @@ class CaneFilterSettings:
     standing_inflation: Factor = 20.0  # samples that share one drift of the hand
     radar_standing: Speed = 0.2  # m/s, radar speed above which nobody stands, whatever the IMU says
     speed_scale: Fraction | Zero = 0.012  # sd of the radar's scale: 1 cm of height; only in the covariance
-    # What is given out of the horizontal covariance: in 50 simulated walks errors were that much smaller (best.md).
-    covariance_share: Factor = 0.8
     heading_interval: Time = 0.1  # s between updates of the tracks
     # s in which the track follows a correction: a person does not jump by millimetres twenty times a second
     correction_time: Time = 0.3
@@ -406,7 +404,6 @@ class CaneFilter(DeadReckoning):
         covariance = level_covariance(self._motion.covariance, heading, turn, velocity, settings.speed_scale)
         if self._turns.variance > 0.0:
             covariance += self._turns.covariance(turn, velocity)
-        covariance *= settings.covariance_share
         covariance[2, 2], covariance[5, 5] = self._heave.height_variance, self._heave.rate_variance
         return PoseEstimate(
             position=(heading.position.real, heading.position.imag, rise),

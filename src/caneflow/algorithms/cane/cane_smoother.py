@@ -125,7 +125,6 @@ def _smoothed_estimate(
     filtered = before.covariance
     assert filtered is not None, "the filter gives one"
     smoothed = level_covariance(covariance[:4, :4], heading, turn, velocity, settings.speed_scale)
-    smoothed *= settings.covariance_share
     smoothed[2, 2], smoothed[5, 5] = filtered[2, 2], filtered[5, 5]
     return PoseEstimate(
         position=(heading.position.real, heading.position.imag, before.position[2]),
