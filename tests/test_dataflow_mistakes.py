@@ -152,7 +152,7 @@ ONE_MISTAKE = {
     "node with a dash": (
         "  imu: {",
         "  im-u: {run: drivers.bno055}\n  imu: {",
-        "3:3: nodes.im-u: is no name; that is a lower-case letter, then lower-case letters, digits or _",
+        "3:3: nodes.im-u: not a valid name; expected a lower-case letter, then lower-case letters, digits or _",
     ),
     "node that is no mapping": (
         "{run: drivers.bno055}",
@@ -389,8 +389,10 @@ BROKEN_PROGRAMS = {
     "'bad.py' holds no program; that is a class derived from Operator, Source or Sink": "x = 1\n",
     "'bad.py' holds several programs: Speed, Other; one file holds one": SPEED + "\nclass Other(Speed): ...\n",
     "'bad.py': Speed does not define handle": SPEED.replace("def handle", "def handel"),
-    "'bad.py': Speed.inputs: 'Frame' is no name of a port; that is a lower-case": SPEED.replace('"frame"', '"Frame"'),
-    "'bad.py': Speed.outputs is no table of ports; that is e.g. {'imu': Imu}": SPEED.replace(
+    "'bad.py': Speed.inputs: 'Frame': not a valid port name; expected a lower-case": SPEED.replace(
+        '"frame"', '"Frame"'
+    ),
+    "'bad.py': Speed.outputs not a table of ports; expected e.g. {'imu': Imu}": SPEED.replace(
         '{"speed": GroundSpeed}', '["speed"]'
     ),
     "'bad.py': Speed.Settings cannot be checked: ": SPEED + "\nclass Odd: ...\nSpeed.Settings = Odd\n",

@@ -55,9 +55,11 @@ BROKEN: dict[str, tuple[bytes, str]] = {
     "binary": (b"\x7fELF\x02\x01\x01\x00", "1:1: is no YAML: character 0x007f is not allowed"),
     "UTF-16": ("flow: demo".encode("utf-16"), "1:1: byte 0xff is no UTF-8; save the file as UTF-8 text"),
     "Latin 1": ("flow: demo\nx: ab\xe9".encode("latin-1"), "2:6: byte 0xe9 is no UTF-8; save "),
-    "too long": (b"#" * (MAX_BYTES + 1), f" is longer than {MAX_BYTES} bytes; that is no dataflow"),
+    "too long": (b"#" * (MAX_BYTES + 1), f" larger than {MAX_BYTES} bytes, the limit for a dataflow file"),
     "too deep": (b"flow: demo\nx: " + b"[" * 500, "1:1: is nested more than 32 deep"),
-    "deep": (b"flow: demo\nx: " + b"[" * 40 + b"]" * 40, "1:1: is nested more than 32 deep; that is no dataflow"),
+    "deep": (
+        b"flow: demo\nx: " + b"[" * 40 + b"]" * 40,
+        "1:1: is nested more than 32 deep, the limit for a dataflow file"),
 }  # fmt: skip
 
 
@@ -75,7 +77,7 @@ def test_a_bomb_of_aliases_is_refused(tmp_path: Path) -> None:
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]  # 10^12 values
 
     assert said(tmp_path / "flow.yaml", "\n".join(lines).encode()) == [
-        "1:1: stands for more than 50000 values; that is no dataflow"
+        "1:1: stands for more than 50000 values, the limit for a dataflow file"
     ]
 
 
@@ -104,10 +106,10 @@ nodes:
         "4:20: rig.hand_height: is not a number; nothing can be set to that",
         "4:36: rig.aperture: 'wide' is no float: could not convert string to float: 'wide'",
         "6:40: nodes.imu.settings: has the tag !python/object; only plain values are read",
-        "7:3: nodes.7: is no key; a key is text, in quotes if need be",
+        "7:3: nodes.7: not a key; expected text, in quotes if need be",
         "8:3: nodes.imu: is written twice, first in line 6; keep one",
         "9:9: nodes.loop.run: contains itself; an alias may not lead to what it stands in",
-        "10:3: nodes.<<: merges what is no mapping",
+        "10:3: nodes.<<: merges what is not a mapping",
     ]
 
 

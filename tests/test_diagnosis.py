@@ -89,8 +89,8 @@ def test_an_endpoint_that_nobody_listens_on(endpoint: str) -> None:
     ("endpoint", "said"),
     [
         ("tcp/no-such-machine.invalid:7447", "no machine is called no-such-machine.invalid"),
-        ("gateway", "gateway is no endpoint"),
-        ("tcp/gateway:x", "tcp/gateway:x is no endpoint"),
+        ("gateway", "gateway: not an endpoint"),
+        ("tcp/gateway:x", "tcp/gateway:x: not an endpoint"),
     ],
 )
 def test_an_address_that_leads_nowhere(endpoint: str, said: str) -> None:

@@ -145,9 +145,9 @@ def test_a_file_that_was_cut_off_gives_what_is_there(tmp_path: Path) -> None:
     ("name", "data", "says"),
     [
         ("none.wav", None, "is not there"),
-        ("empty.wav", b"", "is no sound file"),
-        ("text.wav", b"hello", "is no sound file"),
-        ("sound.raw", b"\0\0", "is no sound file"),
+        ("empty.wav", b"", "not a sound file"),
+        ("text.wav", b"hello", "not a sound file"),
+        ("sound.raw", b"\0\0", "not a sound file"),
     ],
 )
 def test_what_is_no_sound_is_named(name: str, data: bytes | None, says: str, tmp_path: Path) -> None:

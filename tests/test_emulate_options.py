@@ -27,7 +27,7 @@ def test_a_part_of_a_whole(text: str, value: float) -> None:
 
 @pytest.mark.parametrize("text", ["", "2", "-0.1", "101%", "nan", "two", "%"])
 def test_what_is_no_part(text: str) -> None:
-    with pytest.raises(typer.BadParameter, match="is no part of a whole"):
+    with pytest.raises(typer.BadParameter, match="not a share"):
         emulate.share(text)
 
 

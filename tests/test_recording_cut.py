@@ -230,6 +230,8 @@ def test_two_flows_in_one_file_are_no_recording(tmp_path: Path) -> None:
     with RecordingWriter(path, flow="one", source="live", rig={}) as writing:
         for flow in ("one", "two"):
             writing.write(f"{flow}/imu/imu", Imu, numbered(Imu(stamp=1, gyro=(0, 0, 0)), 0), stamp=1, seq=0, log_time=1)
-    with pytest.raises(NothingLeftError, match="what is left of it is no recording: both one/imu/imu and two/imu/imu"):
+    with pytest.raises(
+        NothingLeftError, match="what is left of it is not a recording: both one/imu/imu and two/imu/imu"
+    ):
         recover(path, target)
     assert not target.exists()

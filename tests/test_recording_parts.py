@@ -184,7 +184,7 @@ def test_what_is_no_size_or_time_is_refused(text: str) -> None:
 
 def test_spans() -> None:
     assert [read_span(text) for text in ("30s", "2min", "1h", "45")] == [30, 120, 3600, 45]
-    with pytest.raises(RecordingError, match="'soon' is no time"):
+    with pytest.raises(RecordingError, match="'soon': not a duration"):
         read_span("soon")
 
 

@@ -204,7 +204,7 @@ def _pair(text: str) -> tuple[float, float]:
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
-        raise CalibrationError(f"--start {text}: is no position; give X,Y in m, e.g. 4,0.5") from None
+        raise CalibrationError(f"--start {text}: not a position; expected X,Y in m, e.g. 4,0.5") from None
     return x, y
 
 

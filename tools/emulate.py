@@ -52,7 +52,7 @@ def share(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value <= 1.0:
-        raise typer.BadParameter(f"{text!r} is no part of a whole, e.g. 0.02 or 2%")
+        raise typer.BadParameter(f"{text!r}: not a share; expected e.g. 0.02 or 2%")
     return value
 
 
@@ -80,7 +80,7 @@ Begin: TypeAlias = Annotated[
     float | None,
     typer.Option(metavar="UNIX", help="Unix time (s) at which the recording begins; else when it is first set going."),
 ]
-Seed: TypeAlias = Annotated[int, typer.Option(min=0, help="Of all faults.")]
+Seed: TypeAlias = Annotated[int, typer.Option(min=0, help="Seed of the random faults.")]
 
 
 def _spans(texts: Spans) -> tuple[tuple[float, float], ...]:
@@ -167,7 +167,7 @@ class _Plug:
         """Make the port; raises CaneflowError when something else has its name."""
         # What an emulator that was killed left behind is a link to a pseudo-terminal.
         if os.path.lexists(self._path) and not (self._path.is_symlink() and self._path.readlink().parent == TERMINALS):
-            raise CaneflowError(f"{self._path}: exists and is no emulator's port; choose another name with --port")
+            raise CaneflowError(f"{self._path}: exists and is not an emulator's port; choose another name with --port")
         # This end of the terminal stays open too, or a driver that leaves would take the terminal with it.
         self._ends = os.openpty()
         tty.setraw(self._ends[1])
@@ -191,7 +191,7 @@ class _Plug:
         return os.read(self._ends[0], 4096)
 
     def write(self, data: bytes) -> None:
-        """Say something; what nobody reads is lost, as on a wire."""
+        """Say something; what is not read is lost, as on a wire."""
         with suppress(BlockingIOError):
             os.write(self._ends[0], data)
 

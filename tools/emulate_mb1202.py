@@ -50,7 +50,7 @@ def command(
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
     if os.path.lexists(bus):
         if not stat.S_ISSOCK(bus.lstat().st_mode):
-            raise CaneflowError(f"{bus}: exists and is no emulator's socket; choose another name with --bus")
+            raise CaneflowError(f"{bus}: exists and is not an emulator's socket; choose another name with --bus")
         bus.unlink()  # of an emulator that was killed
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(bus))

@@ -56,7 +56,8 @@ def command(
         str | None,
         typer.Option(
             metavar="NAME,...",
-            help="What to compare; by default all that fusion offers. Also: smoothed, best in hindsight.",
+            help="What to compare; by default all that fusion offers. "
+            "Also: smoothed (`best`, run offline over the whole recording).",
         ),
     ] = None,
     flow: FlowFile = None,

@@ -155,7 +155,7 @@ def _key(flow: str, stream: str) -> str:
     node, _, port = stream.partition("/")
     for name in (flow, node, port):
         if not NAME.fullmatch(name):
-            raise CaneflowError(f"{flow}/{stream}: {name!r} is no name; that is {NAME_RULE}")
+            raise CaneflowError(f"{flow}/{stream}: {name!r} not a valid name; expected {NAME_RULE}")
     return sample_key(flow, node, port)
 
 

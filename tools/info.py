@@ -21,7 +21,7 @@ def command(
     recording: Annotated[Path, typer.Argument(metavar="REC", help="Recording to look into.", show_default=False)],
     full: Annotated[
         bool,
-        typer.Option("--full", help="Read every sample: finds each number that begins anew and each wrong stamp."),
+        typer.Option("--full", help="Read every sample: finds each restart of the numbers and each wrong stamp."),
     ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object; stamps in ns, spans in s, rates in Hz.")

@@ -19,7 +19,7 @@ DEFAULT_FOLDER = Path("keys")  # `caneflow run FILE` looks for it beside the fil
 
 
 def init(folder: Folder = DEFAULT_FOLDER) -> None:
-    """Start a flow's own authority: whoever has no certificate of it gets no link.
+    """Start a flow's own authority: a machine without a certificate of it gets no link.
 
     Keep ca.key to yourself: who has it can let anybody in. It is not needed to run a flow.
 

@@ -97,7 +97,7 @@ def _pattern(text: str | None) -> re.Pattern[str]:
     try:
         return re.compile(text or "")
     except re.error as error:
-        raise CaneflowError(f"--grep {text!r}: is no regular expression: {error}") from error
+        raise CaneflowError(f"--grep {text!r}: not a regular expression: {error}") from error
 
 
 def _since(text: str | None) -> str:
@@ -111,7 +111,7 @@ def _since(text: str | None) -> str:
             at = datetime.fromisoformat(text)
         except ValueError:
             raise CaneflowError(
-                f"--since {text}: is no time; give e.g. 90s, 10min, 2h, 1d or 2026-11-30T14:05 (UTC)"
+                f"--since {text}: not a time; expected e.g. 90s, 10min, 2h, 1d or 2026-11-30T14:05 (UTC)"
             ) from None
         at = at.replace(tzinfo=UTC) if at.tzinfo is None else at.astimezone(UTC)
     return at.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -78,7 +78,7 @@ def fusion_of(graph: Graph, name: str | None) -> Node:
 
 
 def header(constants: ObserverConstants, source: str) -> str:
-    """The C header with the constants; `source` is for whoever reads it."""
+    """The C header with the constants; `source` is for the reader."""
     x, y, z = constants.boresight
     entries = [
         ("GAIN_AA", _integer(constants.gain_aa, GAIN, "Q2.29")),

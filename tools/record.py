@@ -41,7 +41,7 @@ class RecordSettings:
     rotate_bytes: Annotated[int, Ge(1), Le(2**63 - 1)] | None = None  # a new file when this one is as large
     rotate_s: Duration | None = None  # s, a new file after this long
     keep: Annotated[int, Ge(1), Le(10**9)] | None = None  # files; older ones of this run are removed
-    last_s: Duration | None = None  # s that are kept in memory, to be written when somebody asks; nothing else is
+    last_s: Duration | None = None  # s of samples held in memory and written on request only
     run: str | None = None  # the id of the run, the same in all its parts; None: a new one
     goes_on: bool = False  # in the place of a recorder that has ended: what that one wrote is left alone
 

@@ -16,7 +16,7 @@ def command(
         typer.Argument(metavar="[FLOW] NODE", help="The flow may be left out when only one runs here."),
     ],
 ) -> None:
-    """End a node of a running flow in order and start it again, e.g. to read a device anew; the others go on.
+    """End a node of a running flow in order and start it again, e.g. to reopen a device; the others go on.
 
     Waits until it is ready. It continues where it was, as after a failure, but its restart policy does not count it.
     Only the user who runs the flow, and root, may; on the machine on which the node runs. Exit status 0: it is ready

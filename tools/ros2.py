@@ -211,7 +211,7 @@ class Ros2Bridge:
         return [stream for stream, topics in self._streams.items() if not topics]
 
     def take(self, node: str, port: str, kind: type[Sample] | None, decoded: Callable[[], Sample]) -> None:
-        """Publish what a sample becomes, on the topics that somebody listens to; only then is it decoded."""
+        """Publish what a sample becomes, on the topics that have a listener; only then is it decoded."""
         topics = self._streams.get(f"{node}/{port}")
         if topics is None:
             topics = self._declare(node, port, kind)

@@ -262,7 +262,7 @@ def _speed(text: str) -> float:
         value = math.nan
     if not SLOWEST <= value <= FASTEST:
         raise DataflowError(
-            f"--speed {text}: is no speed; give times real time, {SLOWEST:g} to {FASTEST:g}, e.g. 1 or 2.5, or max"
+            f"--speed {text}: not a speed; expected times real time, {SLOWEST:g} to {FASTEST:g} (1, 2.5), or max"
         )
     return value
 

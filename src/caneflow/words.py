@@ -41,7 +41,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "logs": ("logs", "Print what the nodes of a flow have said."),
     "restart": ("restart", "End a node of a running flow and start it again."),
     "stop": ("stop", "End a running flow in order."),
-    "simulate": ("simulate", "Make a recording of a walk that nobody walked."),
+    "simulate": ("simulate", "Simulate a walk and write it as a recording."),
     "info": ("info", "Say what is in a recording."),
     "recover": ("recover", "Make a sound recording of one that was cut short or damaged."),
     "import": ("import_recording", "Make a recording of a device's own log."),

@@ -63,7 +63,7 @@ def _network_attempts(node: Node, error: OSError) -> tuple[str, ...]:
     if isinstance(error, ConnectionRefusedError):
         return (f"{host} is there, but no radar: find the radar's address, then --set {node.name}.host=...",)
     if isinstance(error, socket.gaierror):
-        return (f"{host} is no address; the radar's own is 192.168.1.100 unless it was changed",)
+        return (f"{host} is not an address; the radar's own is 192.168.1.100 unless it was changed",)
     attempts = [
         f"ping {host}: when that is silent too, see cable and power (5 to 48 V, 3 W)",
         "the radar sends to one host only: end the flow, or the vendor's program, that has it",

@@ -21,5 +21,5 @@ def stream_of(key: str) -> tuple[str, str]:
     """Node and port of a sample's key, whatever the flow's name; raises ValueError for any other key."""
     parts = key.split("/")
     if len(parts) != 3 or CONTROL in parts:
-        raise ValueError(f"{key!r} is no sample's key; that is <flow>/<node>/<port>")
+        raise ValueError(f"{key!r}: not a sample's key; expected <flow>/<node>/<port>")
     return parts[1], parts[2]

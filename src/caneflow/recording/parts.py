@@ -53,7 +53,7 @@ def read_span(text: str) -> float:
     """Seconds in `30s`, `2min`, `1h` or `30`; raises RecordingError for another text."""
     number, unit = _quantity(text)
     if unit not in ("", *SPANS) or not number > 0:
-        raise RecordingError(f"{text!r} is no time; give e.g. 30s or 2min")
+        raise RecordingError(f"{text!r}: not a duration; expected e.g. 30s or 2min")
     return number * SPANS.get(unit, 1)
 
 

@@ -470,7 +470,7 @@ def rig_in(path: Path, text: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: the rig in it is no JSON: {error}") from error
     if not isinstance(rig, dict):
-        raise RecordingError(f"{path}: the rig in it is no map, it is {text[:60]!r}")
+        raise RecordingError(f"{path}: the rig in it is not a map but {text[:60]!r}")
     if _is_deeper(rig, MAX_RIG_DEPTH):
         raise RecordingError(f"{path}: the rig in it is nested more than {MAX_RIG_DEPTH} deep; that is no rig")
     return rig

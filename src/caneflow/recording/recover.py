@@ -82,7 +82,7 @@ def _require_readable(path: Path, output: Path) -> None:
     except RecordingError as error:
         output.unlink()
         why = str(error).removeprefix(f"{output}: ")
-        raise NothingLeftError(f"{path}: what is left of it is no recording: {why}") from error
+        raise NothingLeftError(f"{path}: what is left of it is not a recording: {why}") from error
 
 
 def _copy(source: BinaryIO, layout: Layout, target: BinaryIO) -> None:

@@ -82,4 +82,4 @@ class SoundFile:
         except (RuntimeError, TypeError, ValueError) as error:  # TypeError: .raw, of which nothing is known
             if not self.path.exists():
                 raise RecordingError(f"{self.path}: is not there") from error
-            raise RecordingError(f"{self.path}: is no sound file: {str(error).splitlines()[-1]}") from error
+            raise RecordingError(f"{self.path}: not a sound file: {str(error).splitlines()[-1]}") from error

@@ -91,5 +91,5 @@ def with_endpoint(site: Site, listen: str | None) -> Site:
     from caneflow.runtime.dataflow.yaml_shape import ENDPOINT_PATTERN
 
     if not re.fullmatch(ENDPOINT_PATTERN, listen):
-        raise DataflowError(f"--listen {listen}: is no endpoint; write tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447")
+        raise DataflowError(f"--listen {listen}: not an endpoint; expected tcp/HOST:PORT, e.g. tcp/127.0.0.1:7447")
     return replace(site, listen=tuple(dict.fromkeys([*site.listen, listen])))

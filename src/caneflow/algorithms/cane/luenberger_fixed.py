@@ -354,7 +354,7 @@ def _unit(orientation: Quaternion) -> tuple[int, int, int, int]:
     """A quaternion in Q1.30; raises ValueError when its length is not 1, within twice what messages are held to."""
     w, x, y, z = (fixed(each, UNIT)[0] for each in orientation)
     if abs(w * w + x * x + y * y + z * z - (1 << 2 * UNIT)) > UNIT_TOLERANCE:
-        raise ValueError(f"{METHOD}: orientation {orientation} is no rotation; its norm is not 1")
+        raise ValueError(f"{METHOD}: orientation {orientation} is not a rotation; its norm is not 1")
     return w, x, y, z
 
 

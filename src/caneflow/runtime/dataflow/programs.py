@@ -189,10 +189,10 @@ def _check_tables(run: str, program: Program) -> None:
     for table, ports in tables.items():
         where = f"{shown(run)}: {program.__name__}.{table}"
         if not isinstance(ports, Mapping):
-            raise DataflowError(f"{where} is no table of ports; that is e.g. {{'imu': Imu}}")
+            raise DataflowError(f"{where} not a table of ports; expected e.g. {{'imu': Imu}}")
         for port, kind in ports.items():
             if not (isinstance(port, str) and (NAME.fullmatch(port) or port == ANY_PORT)):
-                raise DataflowError(f"{where}: {shown(port)} is no name of a port; that is {NAME_RULE}")
+                raise DataflowError(f"{where}: {shown(port)}: not a valid port name; expected {NAME_RULE}")
             if not (inspect.isclass(kind) and issubclass(kind, Sample)):
                 raise DataflowError(f"{where}[{shown(port)}] is {shown(kind)}; it takes a class of messages")
             try:

@@ -78,7 +78,7 @@ class Checked(Generic[T]):
         if kind == "missing" and last and isinstance(last[0], str):
             return Mistake((*path, *last), f"is missing; {self._right((*path, *last))}", key=True)
         if last == ("[key]",):
-            return Mistake(path, f"is no name; that is {_key_rule(self._at(path[:-1]))}", key=True)
+            return Mistake(path, f"not a valid name; expected {_key_rule(self._at(path[:-1]))}", key=True)
         value = _value_at(values, path)
         choice = next((s["enum"] for s in self._at(path) if "enum" in s), ())
         hint = did_you_mean(value, map(str, choice)) if isinstance(value, str) else ""

@@ -91,7 +91,7 @@ def read_yaml(path: Path) -> Document:
         reason = getattr(error, "strerror", None) or error
         raise _broken(Place(source=source), f"cannot be read: {reason}") from error
     if len(data) > MAX_BYTES:
-        raise _broken(Place(source=source), f"is longer than {MAX_BYTES} bytes; that is no dataflow")
+        raise _broken(Place(source=source), f"larger than {MAX_BYTES} bytes, the limit for a dataflow file")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -158,9 +158,9 @@ class _Plain:
         """Count a value that the text stands for, or that a merge brings."""
         self._count += 1
         if self._count > MAX_VALUES:
-            raise _TooMuch(f"stands for more than {MAX_VALUES} values; that is no dataflow")
+            raise _TooMuch(f"stands for more than {MAX_VALUES} values, the limit for a dataflow file")
         if depth > MAX_DEPTH:
-            raise _TooMuch(f"is nested more than {MAX_DEPTH} deep; that is no dataflow")
+            raise _TooMuch(f"is nested more than {MAX_DEPTH} deep, the limit for a dataflow file")
 
     def _of_kind(self, node: Node, path: KeyPath) -> Any:
         if isinstance(node, MappingNode) and str(node.tag) == TAG + "map":
@@ -191,7 +191,7 @@ class _Plain:
         """The value of one entry of a mapping."""
         self._document.key_places[path] = self._place(key)
         if str(key.tag) not in TEXTS or not _is_text(key.value):
-            self._document.refuse(path, "is no key; a key is text, in quotes if need be", key=True)
+            self._document.refuse(path, "not a key; expected text, in quotes if need be", key=True)
         return self.value(item, path)
 
     def _pairs(self, node: MappingNode) -> Iterator[tuple[Node, Node]]:
@@ -209,7 +209,7 @@ class _Plain:
                     yield from self._merged(merged, path, (*within, id(node)))
                     continue
                 self._document.key_places[*path, "<<"] = self._place(key)
-                wrong = "merges itself" if isinstance(merged, MappingNode) else "merges what is no mapping"
+                wrong = "merges itself" if isinstance(merged, MappingNode) else "merges what is not a mapping"
                 self._document.refuse((*path, "<<"), wrong, key=True)
 
     def _scalar(self, node: ScalarNode, path: KeyPath) -> Any:

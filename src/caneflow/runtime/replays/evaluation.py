@@ -286,7 +286,7 @@ def _estimator(graph: Graph) -> Node:
         raise DataflowError(f"{graph.path}: no node {ESTIMATOR!r}; there are {listed(graph.nodes)}")
     if node.program is None or node.outputs.get(POSE) is not Pose:
         raise DataflowError(
-            f"{graph.path}: nodes.{ESTIMATOR}: is no program with an output {POSE!r} of Pose; nothing to compare"
+            f"{graph.path}: nodes.{ESTIMATOR}: not a program with an output {POSE!r} of Pose; nothing to compare"
         )
     return node
 

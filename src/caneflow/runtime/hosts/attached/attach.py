@@ -274,7 +274,9 @@ def parted(words: Sequence[str]) -> tuple[str | None, list[tuple[str, str]]]:
     for word in words:
         parts = word.split("/")
         if len(parts) > 3 or not all(parts):
-            raise CaneflowError(f"{word!r} names nothing; say a flow (cane), or a stream of one (fusion/pose)")
+            raise CaneflowError(
+                f"{word!r} no such flow or stream; expected a flow (cane) or one of its streams (fusion/pose)"
+            )
         if len(parts) != 2:
             flows[parts[0]] = None
         if len(parts) > 1:

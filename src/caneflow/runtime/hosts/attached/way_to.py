@@ -38,7 +38,7 @@ def way_to(endpoint: str, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
         return
     host, _, port = address.rpartition(":")
     if not (protocol and host and port.isdigit()):
-        text = f"{endpoint} is no endpoint"
+        text = f"{endpoint}: not an endpoint"
         yield Finding(node=endpoint, state="bad", text=text, attempts=("give e.g. --at tcp/gateway.local:7447",))
         return
     try:

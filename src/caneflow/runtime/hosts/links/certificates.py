@@ -66,7 +66,7 @@ def make_authority(folder: Path) -> Path:
     """Start a flow's own authority in `folder`; raises DataflowError when there is one."""
     certificate = folder / f"{AUTHORITY}.crt"
     if certificate.exists() or (folder / f"{AUTHORITY}.key").exists():
-        raise DataflowError(f"{certificate}: is there; a new authority would shut every machine out that has a key")
+        raise DataflowError(f"{certificate}: already exists; a new authority would make every existing key invalid")
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     key = _new_key()
     name = _name(f"caneflow {secrets.token_hex(4)}")  # two authorities are never mistaken for each other
@@ -88,7 +88,7 @@ def make_certificate(
     `anew`: in the place of one that is there. `addresses`: IP addresses and host names by which browsers come to it.
     """
     if not re.fullmatch(NAME.pattern, name):
-        raise DataflowError(f"{name!r} is no name; that is {NAME_RULE}")
+        raise DataflowError(f"{name!r} not a valid name; expected {NAME_RULE}")
     if name in (AUTHORITY, OBSERVER):
         raise DataflowError(f"{name!r} is taken; call the {'observer' if observer else 'machine'} otherwise")
     certificate = folder / f"{name}.crt"
@@ -110,7 +110,7 @@ def certificates(folder: Path) -> Iterator[Listed]:
         try:
             certificate = x509.load_pem_x509_certificate(path.read_bytes())
         except ValueError as error:
-            raise DataflowError(f"{path}: is no certificate: {error}") from error
+            raise DataflowError(f"{path}: not a certificate: {error}") from error
         common = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
         role = "authority" if path.stem == AUTHORITY else "observer" if common == OBSERVER else "machine"
         yield Listed(name=path.stem, role=role, expires=certificate.not_valid_after_utc)
@@ -127,7 +127,7 @@ def _authority(folder: Path) -> "tuple[x509.Certificate, ec.EllipticCurvePrivate
             raise DataflowError(f"{path}: is missing; `caneflow keys init` starts a flow's authority")
     loaded = serialization.load_pem_private_key(key.read_bytes(), None)
     if not isinstance(loaded, ec.EllipticCurvePrivateKey):
-        raise DataflowError(f"{key}: is no key of an elliptic curve, as `caneflow keys init` makes them")
+        raise DataflowError(f"{key}: not a key of an elliptic curve, as `caneflow keys init` makes them")
     return x509.load_pem_x509_certificate(certificate.read_bytes()), loaded
 
 
