@@ -126,7 +126,7 @@ nodes:
     about = "it takes a number, at least 0.01 and at most 10 (m, of the hand above ground)"
     assert lines[1] == f"3:42: rig.hand_height: is 'tall'; {about}"
     assert re.match(r"5:14: nodes\.imu\.run: no program 'drivers\.nosuch' in .*drivers.*operators; ", lines[2])
-    assert "there are drivers.bno055, drivers.doppler_adc" in lines[2]
+    assert "there are drivers.a121, drivers.bno055" in lines[2]
     assert lines[3].startswith("6:30: nodes.radar.restarts: unknown key; did you mean 'restart'? allowed are ext")
     assert lines[4] == (
         "7:42: nodes.speed.inputs.frame: no output 'radar/frames'; did you mean 'radar/frame'? "
