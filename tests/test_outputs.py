@@ -388,6 +388,7 @@ OUTPUTS: dict[tuple[str, str], list[object]] = {
     ("import p440", "output"): ["import", "p440", "LOG", "-o", "OUT"],
     ("import imu-csv", "output"): ["import", "imu-csv", "LOG", "--columns", "time=t,gyro_x=x", "-o", "OUT"],
     ("import a121", "output"): ["import", "a121", "LOG", "-o", "OUT"],
+    ("import mmwave", "output"): ["import", "mmwave", "LOG", "-o", "OUT"],
     ("import wav", "output"): ["import", "wav", "LOG", "-o", "OUT"],
     ("export", "output"): ["export", "REC", "--format", "csv", "--stream", "imu/imu", "-o", "OUT"],
     ("eval", "csv_file"): ["eval", "REC", "--flow", "YAML", "--csv", "OUT"],
@@ -421,6 +422,9 @@ OTHERS = {
     ("experiments", "folder"),
     ("emulate bno055", "port"),
     ("emulate mb1202", "bus"),
+    ("emulate ti_mmwave", "cli"),
+    ("emulate ti_mmwave", "data"),
+    ("import mmwave", "config"),
     ("import rosbag", "rig"),
 }
 

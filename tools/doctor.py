@@ -9,7 +9,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from caneflow.device_checks import a121, bno055, doppler_adc, mpu9250, p440, sonar
+from caneflow.device_checks import a121, bno055, doppler_adc, mpu9250, p440, sonar, ti_mmwave
 from caneflow.device_checks.samples import examine_samples
 from caneflow.errors import CaneflowError
 from caneflow.options import At, Keys
@@ -29,6 +29,7 @@ CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {
     "drivers.doppler_adc": doppler_adc.examine,
     "drivers.sonar": sonar.examine,
     "drivers.a121": a121.examine,
+    "drivers.ti_mmwave": ti_mmwave.examine,
 }
 
 

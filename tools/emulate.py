@@ -408,4 +408,10 @@ def _stream_of(recording: Recording, stream: str | None, kind: type[Sample], wha
     return there[stream].node, there[stream].port
 
 
-commands = {"bno055": bno055, "p440": p440, "a121": "emulate_a121", "mb1202": "emulate_mb1202"}
+commands = {
+    "bno055": bno055,
+    "p440": p440,
+    "a121": "emulate_a121",
+    "ti_mmwave": "emulate_ti_mmwave",
+    "mb1202": "emulate_mb1202",
+}

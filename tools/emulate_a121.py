@@ -1,11 +1,9 @@
 """`caneflow emulate a121`: an Acconeer A121 that is not there, played from a recording over TCP or a serial port."""
 
-import os
 import select
 import signal
 import socket
 import time
-import tty
 from contextlib import suppress
 from pathlib import Path
 from tempfile import gettempdir
@@ -22,11 +20,11 @@ from caneflow.protocols.a121_emulator import A121Server, Outbox, Played
 from caneflow.protocols.errors import ProtocolError
 from caneflow.recording import Recording
 from caneflow.recording.a121_file import read_session
+from caneflow.serial_ports import made_port
 
 MCAP = b"\x89MCAP"  # how a recording begins; all else is taken for the vendor's HDF5
 PORT = str(Path(gettempdir()) / "caneflow-a121")
 LONGEST_WAIT = 0.2  # s
-TERMINALS = Path("/dev/pts")
 AT_ONCE = 65_536  # bytes
 LAST_WORDS = 2.0  # s that a client may take for what was sent last
 TCP_TICKS, SERIAL_TICKS = 1_000_000, 1_000  # per second, of an XC120 and of an XM125
@@ -215,31 +213,6 @@ class SocketClient:
         return 0
 
 
-class TerminalClient:
-    """Whoever opens the serial port."""
-
-    def __init__(self, end: int) -> None:
-        self._end = end
-        os.set_blocking(end, False)
-
-    def fileno(self) -> int:
-        """For `select`."""
-        return self._end
-
-    def read(self) -> bytes | None:
-        """What was written to the port."""
-        try:
-            return os.read(self._end, AT_ONCE)
-        except OSError:
-            return b""
-
-    def write(self, data: bytes) -> int:
-        """Bytes that went into the terminal."""
-        with suppress(OSError):
-            return os.write(self._end, data)
-        return 0
-
-
 def serve(server: A121Server, client: Client) -> None:
     """Serve a client until it leaves, or the recording is over and it has had all."""
     outbox = Outbox()
@@ -281,20 +254,6 @@ def _on_tcp(server: A121Server, recording: Path, port: int) -> None:
 
 def on_serial_port(server: A121Server, recording: Path, path: Path) -> None:
     """Make the port and serve whoever opens it, until the recording is over."""
-    # What an emulator that was killed left behind is a link to a pseudo-terminal.
-    if os.path.lexists(path) and not (path.is_symlink() and path.readlink().parent == TERMINALS):
-        raise CaneflowError(f"{path}: exists and is no emulator's port; choose another name with --port")
-    mine, theirs = os.openpty()  # the other end stays open too: a driver that leaves must not take the terminal along
-    try:
-        tty.setraw(theirs)
-        beside = path.with_name(f"{path.name}.{os.getpid()}")
-        beside.symlink_to(os.ttyname(theirs))
-        beside.replace(path)
+    with made_port(path) as port:
         print(f"A121 of {recording} on {path}", flush=True)
-        serve(server, TerminalClient(mine))
-    except OSError as error:
-        raise CaneflowError(f"{path}: {error.strerror or error}") from error
-    finally:
-        path.unlink(missing_ok=True)
-        os.close(mine)
-        os.close(theirs)
+        serve(server, port)

@@ -192,6 +192,7 @@ def _losses(parsed: Log, scans: Sequence[Scan]) -> str:
 commands = {
     "p440": p440,
     "a121": "import_a121",
+    "mmwave": "import_mmwave",
     "imu-csv": "import_imu_csv",
     "wav": "import_wav",
     "rosbag": "import_rosbag",
