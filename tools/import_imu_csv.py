@@ -123,7 +123,7 @@ def imu_csv(
     told, given = _told(columns, units)
     with whole(None if dry_run else output, inputs=tables, overwrite=overwrite) as recording:
         read = _read(tables, told, given, separator=separator, rate=rate)
-        readings = _joined(tables, read)
+        readings = _joined(tables, read, told)
         for line in _notes(tables, read, readings):
             print(line)
         if recording is not None:
@@ -184,11 +184,14 @@ def _opened(path: Path) -> io.TextIOWrapper:
     return io.TextIOWrapper(raw, encoding=encoding_of(raw.peek()), errors="replace")
 
 
-def _joined(paths: Sequence[Path], tables: Sequence[ImuTable]) -> Joined:
+def _joined(paths: Sequence[Path], tables: Sequence[ImuTable], told: Mapping[str, str]) -> Joined:
     try:
         readings = Joined(tables)
     except ProtocolError as error:
         raise CaneflowError(f"{', '.join(map(str, paths))}: {error}") from error
+    missing = {name.rpartition("_")[0] for name in told if name != "time"} - readings.vectors.keys()
+    if missing:
+        raise CaneflowError(f"--columns: {', '.join(sorted(missing))}: in none of the files")
     if not len(readings):
         raise CaneflowError(f"{paths[0]}: no row that can be used; {_losses(paths, tables)}")
     return readings

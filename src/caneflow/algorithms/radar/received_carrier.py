@@ -35,7 +35,7 @@ LEAST = 6  # echoes that a measurement takes
 # Hz of fast time where no pulse is: what the receiver itself makes, and so the noise to take off
 QUIET = (5.8e9, 7.8e9)
 CLEAR_POWER = 2.0  # times that noise, in the mean over the band: below it a window says too little
-# Relative, 1 sd: against the phase -0.7 % on the rail, 0.1, 0.3 and 1.5 % on three logs of a walker, known to 1 %
+# Relative, 1 sd: against the phase -0.5 % on the rail, 0.1, 0.3 and 1.5 % on three logs of a walker, known to 1 %
 CENTROID_ERROR = 0.01
 CENTROID_WINDOWS = 16  # after which a radar that runs is told the centroid, while the phase has not settled
 SETTLED, SETTLED_ERROR = 12, 0.01  # echoes and relative error from which on a radar that runs is told its carrier

@@ -9,6 +9,7 @@ from caneflow.protocols.imu_csv.text import COMMENT_MARKS
 
 VECTORS = {"gyro": "xyz", "accel": "xyz", "mag": "xyz", "orientation": "wxyz", "linear_accel": "xyz"}  # and their axes
 COLUMNS = ("time", *(f"{vector}_{axis}" for vector, axes in VECTORS.items() for axis in axes))
+MARKS = "#%/! "
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def layout_of(
 def _titles(row: Sequence[str]) -> tuple[str, ...]:
     titles = [title.strip() for title in row]
     if titles and titles[0].startswith(COMMENT_MARKS):
-        titles[0] = titles[0].lstrip("#%/! ")
+        titles[0] = titles[0].lstrip(MARKS)
     if len(titles) > 1 and not titles[0]:
         del titles[0]  # "# time gx": the mark was a cell of its own
     return tuple(titles)
@@ -135,6 +136,8 @@ def _resolved(
 
 def _index(titles: Sequence[str], name: str, wanted: str) -> int:
     """Where a column is: by its title, by a beginning that no other has, or by its number, from 1."""
+    if wanted not in titles and wanted.startswith(COMMENT_MARKS):
+        wanted = wanted.lstrip(MARKS)  # as the first title of a header that is a comment is written
     matches = [i for i, title in enumerate(titles) if title == wanted]
     matches = matches or [i for i, title in enumerate(titles) if wanted and title.startswith(wanted)]
     if len(matches) == 1:
@@ -161,30 +164,42 @@ FILE_WORDS = {
 def shared_out(columns: Mapping[str, str], files: Sequence[str]) -> list[dict[str, str]]:
     """What of `columns` is to be looked for in each of several files, named without their endings.
 
-    `FILE:COLUMN` is in that file alone. Where two vectors are told the same columns, each is in the file that is named
-    after it. Raises ProtocolError where none is.
+    `FILE:COLUMN` is in that file alone, named with its ending or without. Where two vectors are told the same columns,
+    each is in the file that is named after it. Raises ProtocolError where none is.
     """
     if len(files) == 1:
-        return [dict(columns)]
+        return [{name: _parted(value, files)[1] for name, value in columns.items()}]
     shared: list[dict[str, str]] = [{} for _ in files]
-    told = {v: tuple(columns.get(f"{v}_{axis}", "") for axis in axes) for v, axes in VECTORS.items()}
-    for name, value in columns.items():
-        file, _, column = value.partition(":")
+    parted = {name: _parted(value, files) for name, value in columns.items()}
+    titles = {v: [parted.get(f"{v}_{axis}", ("", ""))[1] for axis in axes] for v, axes in VECTORS.items()}
+    for name, (file, title) in parted.items():
         vector = name.rpartition("_")[0]
-        if column and file in files:
+        if file is not None:
             places = [files.index(file)]
-        elif name != "time" and list(told.values()).count(told[vector]) > 1:
+        elif name != "time" and list(titles.values()).count(titles[vector]) > 1:
+            elsewhere = {other for each, (other, _) in parted.items() if not each.startswith(vector)}
             places = [i for i, each in enumerate(files) if _sensor_of(each) == vector]
+            places = places or [i for i, each in enumerate(files) if each not in elsewhere]
             if len(places) != 1:
                 raise ProtocolError(
-                    f"{name}: {value!r} is told for another vector too; "
-                    f"expected FILE:COLUMN, e.g. {name}={files[0]}:{value}"
+                    f"{name}: {title!r} is told for another vector too; "
+                    f"expected FILE:COLUMN, e.g. {name}={files[0]}:{title}"
                 )
         else:
             places = list(range(len(files)))
         for place in places:
-            shared[place][name] = column if column and file in files else value
+            shared[place][name] = title
     return shared
+
+
+def _parted(value: str, files: Sequence[str]) -> tuple[str | None, str]:
+    """The file, without its ending, and the column of FILE:COLUMN; a column's own title may hold a colon."""
+    file, _, column = value.partition(":")
+    base = file.rpartition("/")[2]
+    for name in (file, base, base.rpartition(".")[0]):
+        if column and name in files:
+            return name, column
+    return None, value
 
 
 def _sensor_of(file: str) -> str | None:

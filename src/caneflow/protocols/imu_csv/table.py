@@ -20,6 +20,7 @@ from caneflow.protocols.imu_csv.units import (
     Judged,
     judged_accel,
     judged_gyro,
+    judged_linear,
     judged_mag,
     require_known,
     stated,
@@ -209,9 +210,7 @@ class ImuTable:
             times = (self.stamps - self.stamps[:1]).astype(np.float64) * 1e-9
             accel = self.vectors.get("accel")
             return judged_gyro(times, vector, accel, accel_unit=accel_unit, told=told, stated=found)
-        # Linear acceleration is near zero, so that its size says nothing.
-        unit = told or found or accel_unit or DEFAULT_UNITS[name]
-        return Judged(unit, "told" if told else "as the table states" if found else "as accel")
+        return judged_linear(vector, self.vectors.get("accel"), accel_unit=accel_unit, told=told, stated=found)
 
     def _normalize_orientation(self) -> None:
         quaternions = self.vectors["orientation"]

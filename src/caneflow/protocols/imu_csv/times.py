@@ -20,9 +20,10 @@ COUNTER_BITS = (8, 16, 24, 31, 32)
 # 2024-05-01T12:00:00.010+02:00, with or without separators; a date in another order counts only by its clock.
 ISO = re.compile(r"(\d{4})[-/.]?(\d\d)[-/.]?(\d\d)(?:[T _]+|$)(.*)", re.IGNORECASE)
 CLOCK = re.compile(
-    r"(?:.*[\sT_,])?(\d{1,2}):?(\d\d):?(\d\d)(?:[.,:](\d+))?\s*([ap]\.?m\.?)?\s*(Z|UTC|GMT|[-+]\d\d:?\d\d|[-+]\d\d)?",
+    r"(\d{1,2})[:.-]?(\d\d)[:.-]?(\d\d)(?:[.,:_](\d+))?\s*([ap]\.?m\.?)?\s*(Z|UTC|GMT|[-+]\d\d:?\d\d|[-+]\d\d)?",
     re.IGNORECASE,
 )
+ENDS = re.compile(r"[\sT_,]", re.IGNORECASE)  # of what may stand before a clock time: a date in another order
 MINUTES = re.compile(r"(\d{1,3}):(\d\d)[.,](\d+)")
 
 
@@ -87,6 +88,8 @@ def _time_of_day(cell: str) -> int:
             raise BadRowError("with a time that is not a time")
         day = calendar.timegm((int(year), int(month), int(number), 0, 0, 0)) * SECOND
     found = CLOCK.fullmatch(cell)
+    begins = (other.end() for other in ENDS.finditer(cell))
+    found = found or next((late for begin in begins if (late := CLOCK.fullmatch(cell, begin))), None)
     if found is None:
         raise BadRowError("with a time that is not a time")
     hours, minutes, seconds, fraction, half, zone = found.groups()

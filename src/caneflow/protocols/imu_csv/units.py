@@ -15,7 +15,7 @@ Floats: TypeAlias = NDArray[np.float64]
 
 # What the wire has (rad/s, m/s^2, uT) over what the file has; of time: ns.
 UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0, "d": 86400e9},
+    "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0, "d": 86400e9, "100us": 1e5},
     "gyro": {"rad/s": 1.0, "deg/s": math.radians(1.0), "mdeg/s": math.radians(1e-3)},
     "accel": {"m/s^2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY},
     "mag": {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "mG": 0.1, "G": 100.0},
@@ -23,6 +23,9 @@ UNITS: dict[str, dict[str, float]] = {
 UNITS["linear_accel"] = UNITS["accel"]
 DEFAULT_UNITS = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
 
+LEAST_ROWS = 20
+LEFT_OF_MOTION = 0.5  # of the variation of an accelerometer's magnitude, at most, without the acceleration it holds
+SELDOM = "100us"  # taken where a table states it, and never for the size of the numbers
 STEPS = (6e-4, 0.59)  # s between readings, 1.7 to 1700 Hz: of units a thousand apart at most one fits
 SLOW = 0.1  # s: a thousandth of a longer step is one of a fast IMU
 GYRO_FULL_SCALE = math.radians(2000.0)  # rad/s, of nearly every gyro that people carry
@@ -41,6 +44,7 @@ SPELLINGS: dict[str, dict[str, tuple[str, ...]]] = {
         "us": ("us", "usec", "\N{MICRO SIGN}s", "\N{GREEK SMALL LETTER MU}s", "micros", "microseconds"),
         "ns": ("ns", "nsec", "nanos", "nanoseconds"),
         "d": ("d", "days"),
+        "100us": ("100us", "sampletimefine"),  # Xsens' title; a DOT of theirs counts us under it
     },
     "gyro": {
         "rad/s": ("rad/s", "rad/sec", "rads", "rps", "radians/s", "rad.s-1", "rads-1"),
@@ -95,8 +99,10 @@ def stated(quantity: str, texts: Iterable[str]) -> str | None:
 
 def judged_time(step: float, *, told: str | None, stated: str | None, counts: bool) -> Judged:
     """The unit of time in which `step` (NaN: not known) between readings is one of an IMU's. `counts`: by 1, whole."""
-    likely = [u for u, ns in UNITS["time"].items() if STEPS[0] <= step * ns * 1e-9 <= STEPS[1]]
-    size = likely[0] if likely else None
+    sizes = {u: STEPS[0] <= step * ns * 1e-9 <= STEPS[1] for u, ns in UNITS["time"].items()}
+    size = next((unit for unit, fits in sizes.items() if fits and unit != SELDOM), None)
+    if stated == SELDOM:
+        stated, size = (stated, SELDOM) if sizes[SELDOM] else (None, size)
     unit, why = _chosen("time", told, stated, size, f"readings are {step:.4g} apart")
     if told is not None or not step > 0:
         return Judged(unit, why, _contradiction("time", unit, size) if told is not None else "")
@@ -153,6 +159,28 @@ def judged_gyro(
         settles = "--units gyro=deg/s or gyro=rad/s settles it"
         return Judged(unit, why, f"turns of up to {largest:.3g} can be deg/s too; {settles}")
     return Judged(unit, why, _contradiction("gyro", unit, size))
+
+
+def judged_linear(
+    linear: Floats, accel: Floats | None, *, accel_unit: str | None, told: str | None, stated: str | None
+) -> Judged:
+    """The unit of an acceleration without gravity (n, 3): what is left of `accel` (n, 3, `accel_unit`) is gravity.
+
+    It is near zero, so that its size says nothing, and phones give it in m/s^2 beside an accelerometer in g.
+    """
+    if told or stated or accel is None or accel_unit is None:
+        unit = told or stated or accel_unit or DEFAULT_UNITS["linear_accel"]
+        return Judged(unit, "told" if told else "as the table states" if stated else "the default")
+    known = np.isfinite(linear).all(axis=1) & np.isfinite(accel).all(axis=1)
+    force, linear = accel[known] * UNITS["accel"][accel_unit], linear[known]
+    scales = {"": 0.0, **UNITS["linear_accel"]}
+    # how much the magnitude of the rest varies in each unit; in none of them: of all
+    rests = {unit: float(np.linalg.norm(force - scale * linear, axis=1).std()) for unit, scale in scales.items()}
+    best = min(rests, key=lambda unit: rests[unit])
+    if len(force) >= LEAST_ROWS and best and rests[best] < LEFT_OF_MOTION * rests[""]:
+        return Judged(best, "what is left of accel is gravity")
+    doubt = "--units linear_accel=UNIT settles it" if accel_unit != DEFAULT_UNITS["linear_accel"] else ""
+    return Judged(accel_unit, "as accel", doubt and f"accel less it is not gravity in any unit; {doubt}")
 
 
 def gravity_turn(times: Floats, gyro: Floats, accel: Floats) -> float | None:
