@@ -99,6 +99,8 @@ class Fusion(Operator):
                 self._estimator.velocity(stamp, velocity, covariance, ground.velocity_delay)
             else:
                 self._hold("velocity")
+        if ground.spread is not None:
+            self._estimator.spread(stamp, ground.spread, ground.spread_delay)
         has_gates = self._estimator.has_gates
         if has_gates or not ground.valid or self._speeds.passes(stamp, ground.speed, 0.0, ground.delay):
             self._estimator.speed(stamp, ground.speed, ground.quality, ground.valid, ground.delay)

@@ -105,6 +105,8 @@ class GroundSpeedOperator(Operator):
             velocity=velocity.velocity if velocity is not None else None,
             velocity_cov=velocity.covariance if velocity is not None else None,
             velocity_delay=velocity.delay if velocity is not None else None,
+            spread=velocity.spread if velocity is not None else None,
+            spread_delay=velocity.spread_delay if velocity is not None else None,
         )
 
 

@@ -195,6 +195,8 @@ class World:
             ),
             velocity_cov=self.maybe(lambda: (xx, self.dice.choice((0.0, root, -root, 0.3 * root)), yy)),
             velocity_delay=self.maybe(lambda: self.number(0.03, 0.0, bounds.DELAY)),
+            spread=self.maybe(lambda: self.number(0.3, 0.0, bounds.SPREAD)),
+            spread_delay=self.maybe(lambda: self.number(0.13, 0.0, bounds.DELAY)),
         )
 
     def points(self, stamp: int) -> RadarPoints:

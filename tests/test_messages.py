@@ -66,7 +66,7 @@ EXAMPLES: list[Sample] = [
     GroundSpeed(
         stamp=9, speed=1.1, quality=0.05, rays=12, valid=True, delay=0.32,
         velocity=(1.0, 0.1), velocity_cov=(0.01, 0.0, 1e6), velocity_delay=0.03, vertical=-0.02,
-        vertical_sd=0.03,
+        vertical_sd=0.03, spread=0.4, spread_delay=0.13,
     ),
     Pose(
         stamp=10, position=(1.0, 2.0, 3.0), velocity=(0.0, 0.0, 0.0), orientation=(0.0, 0.0, 0.0, 1.0),

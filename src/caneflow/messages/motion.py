@@ -80,6 +80,10 @@ class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fals
         None
     )
     vertical_sd: Annotated[bounds.Deviation | None, Meta(description="m/s, its standard deviation")] = None
+    spread: Annotated[
+        bounds.Deviation | None, Meta(description="m/s, the speed to the side that would widen the Doppler as much")
+    ] = None
+    spread_delay: Annotated[bounds.Delay | None, Meta(description="s by which spread lags the stamp")] = None
 
     def __post_init__(self) -> None:
         require_within("speed", self.speed, -bounds.SPEED, bounds.SPEED, "m/s")
@@ -98,6 +102,10 @@ class GroundSpeed(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=Fals
             require_within("vertical", self.vertical, -bounds.SPEED, bounds.SPEED, "m/s")
         if self.vertical_sd is not None:
             require_within("vertical_sd", self.vertical_sd, 0.0, bounds.SPREAD, "m/s")
+        if self.spread is not None:
+            require_within("spread", self.spread, 0.0, bounds.SPREAD, "m/s")
+        if self.spread_delay is not None:
+            require_within("spread_delay", self.spread_delay, 0.0, bounds.DELAY, "s")
 
 
 class Pose(Sample, frozen=True, kw_only=True, omit_defaults=True, gc=False):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.heading_hypotheses import Heading, HeadingHypotheses, HeadingSettings
+from caneflow.algorithms.cane.sideways_spread import SidewaysSpread, SidewaysSpreadSettings
 from caneflow.algorithms.cane.speed_gate import StatedVariance
 from caneflow.algorithms.cane.swing_marks import SwingMarks
 from caneflow.algorithms.cane.walk_motion import Axes, WalkMotion, WalkMotionSettings
@@ -74,6 +75,7 @@ class CaneFilterSettings:
     heading_interval: Time = 0.1  # s between updates of the tracks
     # s in which the track follows a correction: a person does not jump by millimetres twenty times a second
     correction_time: Time = 0.3
+    spread: SidewaysSpreadSettings = field(default_factory=SidewaysSpreadSettings)
     standing: StandingSettings = field(default_factory=StandingSettings)
     motion: WalkMotionSettings = field(default_factory=WalkMotionSettings)
     heading: HeadingSettings = field(default_factory=HeadingSettings)
@@ -106,7 +108,15 @@ class _Measured(NamedTuple):
         return self.stamp_ns - round(self.delay * 1e9)
 
 
+class _Spread(NamedTuple):
+    stamp_ns: int
+    of_ns: int  # the time that it belongs to
+    spread: float  # m/s
+
+
 _HISTORY: Final = 64  # IMU samples that a velocity may come late
+_LARGEST_SPREAD: Final = 2.0  # m/s; what is wider is no ground
+_LONGEST_SPREAD: Final = 0.6  # s by which it may lag: as far as the history reaches
 _VERTICAL: Final = 1e-6  # horizontal part of a unit vector, below which it has no direction
 _UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
 _POINTING_TIME: Final = 0.2  # s
@@ -140,6 +150,8 @@ class CaneFilter(DeadReckoning):
         self._heave = HeaveObserver(settings.heave)
         self._start_height: float | None = None  # m, None before the first sample
         self._waiting: deque[_Measured] = deque(maxlen=16)
+        self._waiting_spreads: deque[_Spread] = deque(maxlen=4)
+        self._spread = SidewaysSpread(settings.spread)
         self._history: deque[_Instant] = deque(maxlen=_HISTORY)
         self._gained = 0j  # m/s since the start
         self._acceleration = 0j  # m/s^2 in the gyro's frame, of the last sample
@@ -200,6 +212,11 @@ class CaneFilter(DeadReckoning):
             if share > 0.0 and (was_lonely or not lonely):
                 self._waiting.append(_Measured(stamp_ns, delay or 0.0, forward, left, xx / share, yy / share))
 
+    def spread(self, stamp_ns: int, spread: float, delay: float | None) -> None:
+        """Take the width of the Doppler as the sideways speed that it would come from, m/s; one of a hand."""
+        if 0.0 <= spread <= _LARGEST_SPREAD and (delay or 0.0) <= _LONGEST_SPREAD:
+            self._waiting_spreads.append(_Spread(stamp_ns, stamp_ns - round((delay or 0.0) * 1e9), spread))
+
     def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`.
 
@@ -233,6 +250,7 @@ class CaneFilter(DeadReckoning):
         turned = self._pointing.update(interval, cmath.phase(facing))
         self._remember(stamp_ns, turn, facing, orientation, gyro)
         self._take_velocities(stamp_ns)
+        self._take_spreads(stamp_ns)
         self._open_while_unseen(stamp_ns, interval)
         self._use_gait(interval, stands, turn, orientation, gyro)
         if self._swing.update(elapsed, turned):
@@ -303,6 +321,21 @@ class CaneFilter(DeadReckoning):
                 if variance < _UNOBSERVED:
                     self._observe(measured.stamp_ns, direction, value + (since * direction.conjugate()).real, variance)
             self._radar_speed = measured.forward
+
+    def _take_spreads(self, before_ns: int) -> None:
+        """Correct the sideways speed by the Doppler's width, which has no sign: the filter's."""
+        while self._waiting_spreads and self._waiting_spreads[0].stamp_ns < before_ns:
+            measured = self._waiting_spreads.popleft()
+            then = self._instant(measured.of_ns)
+            if not abs(then.facing) > _VERTICAL:
+                continue
+            left = then.facing / abs(then.facing) * 1j
+            since = self._gained - then.gained - then.lever
+            velocity = (complex(*self._motion.velocity) - since) / left
+            found = self._spread.update(measured.of_ns, measured.spread, -velocity.imag, velocity.real)
+            if found is not None:
+                value = found.speed + (since * left.conjugate()).real
+                self._motion.observe_velocity((left.real, left.imag), value, found.variance)
 
     def _observe(self, stamp_ns: int, direction: complex, value: float, variance: float) -> None:
         """Correct by the radar. When the filter has called all it says an outlier for long, the filter is wrong."""

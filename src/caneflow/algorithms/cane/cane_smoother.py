@@ -91,6 +91,7 @@ class CaneSmoother:
         # inputs go to the filter as they are
         self.speed = self._filter.speed
         self.velocity = self._filter.velocity
+        self.spread = self._filter.spread
 
     def imu(self, stamp_ns: int, reading: ImuReading) -> None:
         """As `CaneFilter.imu`, but for the estimates, which come all together at the end."""

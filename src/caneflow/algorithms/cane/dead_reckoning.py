@@ -57,6 +57,9 @@ class DeadReckoning(ABC):
     ) -> None:
         """Take a velocity along the boresight's projection and to its left (m/s), with xx, xy, yy ((m/s)^2)."""
 
+    def spread(self, stamp_ns: int, spread: float, delay: float | None) -> None:  # noqa: B027
+        """Take the width of the Doppler as the speed to the side that it would come from, m/s."""
+
     @abstractmethod
     def imu(self, stamp_ns: int, reading: ImuReading) -> PoseEstimate:
         """The estimate at `stamp_ns`, from an IMU sample."""

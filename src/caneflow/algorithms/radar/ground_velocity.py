@@ -32,6 +32,7 @@ from caneflow.algorithms.quantities import (
     TurnRate,
     Zero,
 )
+from caneflow.algorithms.radar.doppler_spread import doppler_spread
 from caneflow.algorithms.radar.effective_range import EffectiveRanges
 from caneflow.algorithms.radar.footprint import CaneGeometry, antenna_height, pitch
 from caneflow.algorithms.radar.matched_velocity import Doubts, lag_sums, matched_speed
@@ -76,6 +77,8 @@ class GroundVelocitySettings:
     height_error: Length = 0.03  # m, sd of a person's hand about the rig's height
     height_walk: Density | Zero = 0.002  # m / sqrt(s)
     height_time: Time = 0.5  # s that tell the height as much as one estimate would by itself
+    spread_window: Time | Zero = 0.25  # s of scans whose Doppler's width is looked at, once in as long
+    spread_lag: Time = 0.03  # s between scans that are compared with neighbours
     rest_turn_rate: TurnRate = math.radians(5.0)  # rad/s, mean norm, below which standing ground is rest
     rest_speed: Speed = 0.03  # m/s, sd of the antenna's then: drift and tremor of a hand
     rest_standing: Factor = 0.05  # of a scan's noise, power of the ground that stands then
@@ -97,6 +100,8 @@ class VelocityEstimate:
     covariance: Triple  # xx, xy, yy, (m/s)^2; UNOBSERVED where not observed
     delay: float  # s from the window's middle, where the estimate belongs, to the newest scan
     valid: bool  # some component is observed
+    spread: float | None = None  # m/s, the speed to the side that would make the Doppler as wide as it is
+    spread_delay: float | None = None  # s, from where it belongs to the newest scan
 
 
 class Fit(NamedTuple):
@@ -118,6 +123,8 @@ class _Cells(NamedTuple):
     per_forward: Floats  # rad per m/s
     per_vertical: Floats  # rad per m/s
     per_height: Floats  # rad per m/s and m
+    cosine: Floats  # of the grazing angle
+    per_speed: float  # rad per m/s of radial speed
     first: int  # number of the first of them in the window
 
 
@@ -139,8 +146,10 @@ class GroundVelocityEstimator:
     def __init__(self, settings: GroundVelocitySettings, geometry: CaneGeometry) -> None:
         self._settings = settings
         self._geometry = geometry
-        self._pairs = 2  # of scans in a window
+        self._pairs, self._period = 2, 0.0  # of scans in a window; s between scans
         self._window = PulsePairWindow(window=self._pairs, cell=settings.cell)
+        self._long_scans = 0  # in the window of the Doppler's width, 0: it is not looked at
+        self._since_spread = 0.0  # s
         self._ranges = EffectiveRanges(settings.pulse_spread)
         self._last_ns: int | None = None  # when an estimate was due last
         self._heave = HeaveObserver(settings.heave)
@@ -206,6 +215,7 @@ class GroundVelocityEstimator:
             return _nothing(delay)
         fit = self._fit(cells, rise, rise_error)
         total = float(np.add.reduce(cells.power))
+        self._since_spread += elapsed
         coherence = float(np.add.reduce(np.abs(cells.pairs) * np.cos(fit.residual))) / total if total > 0 else 0.0
         if coherence < settings.least_fit:
             turn_rate = attitudes.mean_turn_rate(oldest_ns, newest_ns)
@@ -216,21 +226,42 @@ class GroundVelocityEstimator:
         if float(np.maximum.reduce(cells.per_forward)) * abs(fit.forward) > settings.alias_share * math.pi:
             return _nothing(delay)
         self._learn_height(fit, elapsed)
+        spread = self._spread(cells, returns.parameters.scan_period, axis)
         return VelocityEstimate(
             velocity=(fit.forward, 0.0),
             covariance=(fit.forward_variance, 0.0, UNOBSERVED),
             delay=delay,
             valid=True,
+            spread=spread,
+            spread_delay=None if spread is None else 0.5 * (self._long_scans - 1) * returns.parameters.scan_period,
         )
+
+    def _spread(self, cells: _Cells, period: float, axis: float) -> float | None:
+        """Width of the Doppler over the long window, m/s to the side; None where none is due, or to be had."""
+        settings = self._settings
+        if not self._long_scans or not self._window.is_filled:
+            return None
+        if self._since_spread < settings.spread_window - 0.5 * settings.every:
+            return None
+        self._since_spread = 0.0
+        aperture = self._geometry.aperture_across or self._geometry.aperture
+        per_sideways = cells.cosine * (cells.per_speed**2 * aperture**2 / (16.0 * math.log(2.0) * math.cos(axis)))
+        scans = self._window.long_scans(cells.first, len(cells.power))
+        lag = _lag(settings, period)
+        return doppler_spread(scans, self._window.cell_bins, lag, per_sideways, least_fit=settings.least_fit)
 
     def _begin(self, returns: MovingReturns) -> None:
         """Make the window for scans of another period; all that was in it is forgotten anyway."""
-        pairs = max(round(self._settings.window / returns.parameters.scan_period), 2)
-        if pairs != self._pairs:
-            self._pairs = pairs
+        period = returns.parameters.scan_period
+        pairs = max(round(self._settings.window / period), 2)
+        if (pairs, period) != (self._pairs, self._period):
+            self._pairs, self._period = pairs, period
             # weak scans are not added up before they are compared: phases of neighbouring bins need not be alike
             cell = ONE_BIN if pairs >= MANY_PAIRS else self._settings.cell
-            self._window = PulsePairWindow(window=pairs, cell=cell)
+            settings, self._long_scans = self._settings, 0
+            if settings.spread_window and pairs < MANY_PAIRS:
+                self._long_scans = round(settings.spread_window / period) + _lag(settings, period)
+            self._window = PulsePairWindow(window=pairs, cell=cell, kept=self._long_scans)
 
     def _due(self, returns: MovingReturns) -> float | None:
         """Seconds since the last estimate was due, if one is now: to the nearest frame."""
@@ -300,6 +331,8 @@ class GroundVelocityEstimator:
             per_forward=along,
             per_vertical=sine,
             per_height=per_height,
+            cosine=np.sqrt(1.0 - (height / ranges) ** 2),
+            per_speed=per_speed,
             first=sums.first,
         )
 
@@ -398,6 +431,11 @@ def _solved(normal: list[list[float]]) -> tuple[Triple, tuple[float, float]]:
         (ac * p + bc * q + cc * r) / determinant,
     )
     return solution, (aa / determinant, cc / determinant)
+
+
+def _lag(settings: GroundVelocitySettings, period: float) -> int:
+    """Scans between those that are compared with neighbours."""
+    return max(round(settings.spread_lag / period), 2)
 
 
 def _rest(delay: float, speed: float) -> VelocityEstimate:

@@ -51,14 +51,19 @@ def line_phase(pairs: NDArray[np.complexfloating]) -> float:
 class PulsePairWindow:
     """The newest scans; what is asked of them is worked out when it is asked for."""
 
-    def __init__(self, *, window: int, cell: float, lag: int = 1) -> None:
-        """For sums over `window` pairs of scans, `lag` scans apart, and over cells of `cell` m."""
+    def __init__(self, *, window: int, cell: float, lag: int = 1, kept: int = 0) -> None:
+        """For sums over `window` pairs of scans, `lag` scans apart, and over cells of `cell` m.
+
+        As many scans are `kept` for those who look back farther, at least those of the window.
+        """
         self._lag, self._cell = lag, cell
+        self._length, self._kept = window + lag, max(kept, window + lag)
+        self._count = 0  # of scans since all before were forgotten
         self._stamps_ns: deque[int] = deque(maxlen=window + lag)
         self._bins = 1  # of a cell
         self._ranges: Floats = np.zeros(0)
         self._range_list: list[float] = []  # the same
-        self._scans = SlowTimeWindow(length=window + lag, bins=0)
+        self._scans = SlowTimeWindow(length=self._kept, bins=0)
 
     @property
     def cell_bins(self) -> int:
@@ -72,6 +77,12 @@ class PulsePairWindow:
         for scan in returns.scans:
             self._scans.push(scan)
         self._stamps_ns.extend(returns.stamps_ns)
+        self._count += len(returns.scans)
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether there are as many scans as are kept."""
+        return self._count >= self._kept
 
     def interval_ns(self) -> tuple[int, int] | None:
         """Stamps of the oldest and the newest scan in the sums; None while there are too few."""
@@ -83,7 +94,8 @@ class PulsePairWindow:
         """The sums over the whole window, for cells between two ranges (m)."""
         # numpy's search costs ten times as much for two numbers
         first, last = bisect_left(self._range_list, nearest), bisect_left(self._range_list, farthest)
-        scans = self._scans.view()[first * self._bins : last * self._bins].T  # (window + lag, bins)
+        # (window + lag, bins)
+        scans = self._scans.view()[first * self._bins : last * self._bins, -self._length :].T
         newer, older = scans[self._lag :], scans[: -self._lag]
         power = scans.real**2 + scans.imag**2
         both = np.add.reduce(power[self._lag :]) + np.add.reduce(power[: -self._lag])
@@ -99,7 +111,11 @@ class PulsePairWindow:
         """The scans between two ranges (m), (W, K), the cells' ranges, the first one's number; for cells of one bin."""
         assert self._bins == 1, "made so"
         first, last = bisect_left(self._range_list, nearest), bisect_left(self._range_list, farthest)
-        return self._scans.view()[first:last].T, self._ranges[first:last], first
+        return self._scans.view()[first:last, -self._length :].T, self._ranges[first:last], first
+
+    def long_scans(self, first: int, count: int) -> NDArray[np.complex64]:
+        """All scans that are kept, oldest first, over the bins of `count` cells from the `first` on, (W, K)."""
+        return self._scans.view()[first * self._bins : (first + count) * self._bins].T
 
     def power(self, scan: NDArray[np.complex64], first: int, count: int) -> Floats:
         """Sums of |x|^2 of one `scan`, shape (M,), over the bins of `count` cells from the `first` on."""
@@ -116,6 +132,6 @@ class PulsePairWindow:
         middles = self._bins * np.arange(bins // self._bins, dtype=np.float64) + 0.5 * (self._bins - 1)
         self._ranges = np.asarray(parameters.range_start + parameters.range_step * middles, dtype=np.float64)
         self._range_list = self._ranges.tolist()
-        assert self._stamps_ns.maxlen is not None, "made so"
-        self._scans = SlowTimeWindow(length=self._stamps_ns.maxlen, bins=bins)
+        self._scans = SlowTimeWindow(length=self._kept, bins=bins)
+        self._count = 0
         self._stamps_ns.clear()

@@ -32,6 +32,8 @@ def smoothed_poses(
         while speed is not None and speed.stamp < imu.stamp:
             if speed.velocity is not None and speed.velocity_cov is not None:
                 smoother.velocity(speed.stamp, speed.velocity, speed.velocity_cov, speed.velocity_delay)
+            if speed.spread is not None:
+                smoother.spread(speed.stamp, speed.spread, speed.spread_delay)
             smoother.speed(speed.stamp, speed.speed, speed.quality, speed.valid, speed.delay)
             speed = next(coming, None)
         reading = ImuReading(
