@@ -109,11 +109,11 @@ def files() -> dict[str, bytes]:
         "1000 channels, message by message": MAGIC
         + START
         + b"".join(channel(k, f"c/n{k}/p") + message(k, SECOND) for k in range(1, 1001))
-        + b"".join(message(1 + k % 1000, SECOND + 1 + k, 1 + k // 1000) for k in range(10_000)),
+        + b"".join(message(1 + k % 1000, SECOND + 1 + k, 1 + k // 1000) for k in range(5_000)),
         "tiny chunks": MAGIC
         + START
         + numbered(1000)
-        + b"".join(chunk(message(1 + k % 1000, SECOND + k)) for k in range(2000)),
+        + b"".join(chunk(message(1 + k % 1000, SECOND + k)) for k in range(1000)),
         "empty chunks": MAGIC + START + chunk(b"") * 5000,
         "chunks of zeros": MAGIC + START + zeros * 6,
         "a chunk of the same message": MAGIC + START + IMU + chunk(message(1, SECOND, 0, b"") * 1_500_000),
@@ -145,7 +145,7 @@ def files() -> dict[str, bytes]:
         + START
         + chunk(numbered(1000))
         + b"".join(
-            chunk(b"".join(message(k, SECOND * k + j, j, b"") for k in range(1, 1001))) for j in range(30)
+            chunk(b"".join(message(k, SECOND * k + j, j, b"") for k in range(1, 1001))) for j in range(15)
         ),
         "streams far apart in the file": MAGIC
         + START

@@ -22,6 +22,7 @@ from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.simulation.scenario import Walk, simulate_walk
 from operators.fusion import Fusion, FusionSettings
 from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings
+from tests.flows import caneflow_here
 
 ROOT = Path(__file__).parents[1]
 WARM = 400  # samples before what is measured: the windows are full and the walker walks
@@ -168,7 +169,7 @@ def test_stage(benchmark: Any) -> None:
 def test_the_command_says_where_the_time_goes(tmp_path: Path) -> None:
     recording = tmp_path / "walk.mcap"
     caneflow = [sys.executable, "-m", "caneflow.command"]
-    subprocess.run([*caneflow, "simulate", "walk", "--duration", "3", "-o", str(recording)], check=True, timeout=60)
+    assert caneflow_here("simulate", "walk", "--duration", 3, "-o", recording).returncode == 0
     done = subprocess.run(
         [*caneflow, "bench", str(recording), "--flow", str(ROOT / "dataflow.yaml"), "--repeat", "1", "--json"],
         check=True, timeout=60, capture_output=True, text=True,

@@ -464,7 +464,7 @@ wirings = st.integers(1, 6).flatmap(
 
 
 @given(wirings)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_cycles_are_reported_exactly_when_a_node_reaches_itself(
     tmp_path_factory: pytest.TempPathFactory, reads: dict[str, list[str]]
 ) -> None:
@@ -540,7 +540,7 @@ def flow_style(value: Any) -> str:
 
 
 @given(st.data(), st.sampled_from(sorted(LEVELS)))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_stray_key_is_found_where_it_was_written(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, level: str
 ) -> None:

@@ -201,7 +201,7 @@ def must_be_lines_or_a_graph(path: Path, text: str, sets: list[str]) -> None:
 
 
 @given(mutated(), st.lists(overrides, max_size=1))
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 @example(text=FLOW, sets=["imu.x\n=1"])
 @example(text='flow: "a\\ud800"', sets=[])
 @example(text="%\n", sets=[])
@@ -213,7 +213,7 @@ def test_no_text_is_answered_by_anything_but_lines(
 
 
 @given(misshapen(), st.lists(overrides, max_size=1))
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_no_values_are_answered_by_anything_but_lines(
     tmp_path_factory: pytest.TempPathFactory, text: str, sets: list[str]
 ) -> None:

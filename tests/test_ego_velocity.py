@@ -248,7 +248,7 @@ def test_a_boresight_along_the_bodys_z_needs_an_orientation() -> None:
         speeds_of({"points": [], "imu": []}, {"boresight": [0.0, 0.0, -1.0]})
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_a_real_loop_held_in_the_hand_closes(seed: int) -> None:
     """23 m of an IWR6843 and an IMU; gyro yaw, and the velocities integrated, end where they began."""
     if not LOOP.exists():

@@ -136,10 +136,10 @@ def test_an_experiment_that_is_not_there_is_an_error() -> None:
 
 
 def test_the_command_writes_the_same_page_again(tmp_path: Path) -> None:
-    """On a walk of 5 s in the place of the whole one."""
+    """On a walk of 4 s in the place of the whole one."""
     walk = tmp_path / "walks" / experiments.fingerprint() / "swing_1.mcap"
     walk.parent.mkdir(parents=True)
-    simulate.walk(output=walk, scenario="swing", seed=1, duration=5.0)
+    simulate.walk(output=walk, scenario="swing", seed=1, duration=4.0)
 
     def written(name: str) -> tuple[str, bytes]:
         output = tmp_path / name / "results.md"
@@ -149,7 +149,7 @@ def test_the_command_writes_the_same_page_again(tmp_path: Path) -> None:
 
     first = written("first")
     assert written("second") == first
-    assert "Scenario `swing`, 1 x 5 s on average" in first[0]
+    assert "Scenario `swing`, 1 x 4 s on average" in first[0]
     assert list(walk.parent.iterdir()) == [walk]
 
 

@@ -20,7 +20,7 @@ from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings
 from tests.test_operators_cane import samples_of
 
 METHODS: tuple[Method, ...] = tuple(each for each in get_args(Method) if each != "zero_velocity")  # a cane is no foot
-EACH_SECOND = tuple(range(250, 1000, 100))
+EACH_SECOND = tuple(range(250, 800, 100))
 BEGINNING = (0, 1)
 REST = (100, 101)  # the walk begins with 2 s of rest
 IN_A_ROW = (600, 601, 602)
@@ -28,7 +28,7 @@ IN_A_ROW = (600, 601, 602)
 
 @cache
 def walk() -> Walk:
-    return simulate_walk("swing", seed=7, duration=11.0)
+    return simulate_walk("swing", seed=7, duration=9.0)
 
 
 def context() -> Context:

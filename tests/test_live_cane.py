@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from caneflow.messages import Imu, Pose, RadarFrame, Sample, numbered, sample_key
 from caneflow.protocols.bno055 import ACCEL_STEP, GYRO_STEP, QUATERNION_STEP
 from caneflow.recording import Recording, RecordingWriter
-from tests.flows import node_processes
+from tests.flows import caneflow_here, node_processes
 
 ROOT = Path(__file__).parents[1]
 CANEFLOW = [sys.executable, "-m", "caneflow.command"]
@@ -67,6 +67,12 @@ def run_to_its_end(*args: object) -> str:
     done = subprocess.run(
         [*CANEFLOW, *map(str, args)], capture_output=True, text=True, timeout=3 * DEADLINE, check=False
     )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def said_here(*args: object) -> str:
+    done = caneflow_here(*args)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -168,7 +174,7 @@ class Desk(NamedTuple):
 def desk(tmp_path: Path) -> Callable[[int], Desk]:
     def make(seconds: int) -> Desk:
         walk, rig, flow = (tmp_path / name for name in ("walk.mcap", "rig.yaml", "dataflow.yaml"))
-        run_to_its_end("simulate", "walk", "--seed", 1, "--duration", seconds, "-o", walk)
+        said_here("simulate", "walk", "--seed", 1, "--duration", seconds, "-o", walk)
         with Recording(walk) as recording:
             span = recording.span()
             rig.write_text(str(recording.rig))
@@ -243,17 +249,17 @@ def test_live_gives_the_track_of_the_replay(
     of_imu, of_radar = heard_part(given.walk, out, heard).values()
     assert of_imu > 0.5
     assert of_radar > 0.8
-    replay = ("--speed", "max", "--record", replayed, "--overwrite")
-    run_to_its_end("run", given.flow, *given.rig, "--replay", heard, *replay)
+    replay = ("--in-process", "--record", replayed, "--overwrite")
+    said_here("run", given.flow, *given.rig, "--replay", heard, *replay)
     distance, walked = apart(track(out, lived.begin), track(replayed, given.begin))
     assert walked > 0.3 * seconds
     late = max(read_late(given.walk, out) - READ_LATE, 0.0) * TURNING
     assert distance < APART + (APART_OF_WAY + late) * walked, f"{late} rad late"
     if min(of_imu, of_radar) > NEARLY_ALL:
-        run_to_its_end("run", given.flow, *given.rig, "--replay", given.walk, *replay)
+        said_here("run", given.flow, *given.rig, "--replay", given.walk, *replay)
         distance, walked = apart(track(out, lived.begin), track(replayed, given.begin))
         assert distance < APART + (MISSING_APART_OF_WAY + late) * walked, f"{late} rad late"
-    assert "samples equal in every byte" in run_to_its_end("verify", given.flow, out)
+    assert "samples equal in every byte" in said_here("verify", given.flow, out)
 
 
 @pytest.mark.long

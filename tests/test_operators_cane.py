@@ -114,6 +114,7 @@ def told(scans: np.ndarray) -> list[GroundSpeed]:
     return out[70:]
 
 
+@cache
 def at_rest(snr: float) -> np.ndarray:
     """Scans of the walk's first 1.9 s at another SNR (dB)."""
     settings = walk_settings("straight", 3)
@@ -137,8 +138,10 @@ BLIND: dict[str, np.ndarray | float] = {
 }
 
 
-@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32, np.complex64])
-@pytest.mark.parametrize("seen", BLIND)
+@pytest.mark.parametrize(
+    ("seen", "dtype"),
+    [*((seen, np.int32) for seen in BLIND), *(("noise", dtype) for dtype in (np.int16, np.float32, np.complex64))],
+)
 def test_where_the_radar_sees_nothing_nobody_stands(seen: str, dtype: type) -> None:
     made = BLIND[seen]
     scans = at_rest(made) if isinstance(made, float) else made

@@ -171,6 +171,7 @@ def test_zero_velocity_closes_the_loop(steps: list[Reading]) -> None:
     assert 23.0 < length < 28.0
 
 
+@pytest.mark.long
 def test_the_loop_closes_with_other_thresholds_too(steps: list[Reading]) -> None:
     """Half as much again: 0.26 m, so that the default is no lucky choice."""
     stance = StanceSettings(accel=1.5 * 1.7, gyro=math.radians(1.5 * 17.0))

@@ -70,7 +70,7 @@ def endpoint_in(file: Path) -> str:
 
 def replay_on_both(launch: Launch, file: Path, tmp_path: Path) -> None:
     """Replay a walk on both machines, and compare what each recorded with the run on one."""
-    walk = write_walk(tmp_path / "walk.mcap")
+    walk = write_walk(tmp_path / "walk.mcap", 150)
     alone = tmp_path / "alone.mcap"
     done = caneflow_here("run", file, "--replay", walk, "--in-process", "--record", alone)
     assert done.returncode == 0, done.stderr

@@ -26,9 +26,9 @@ RIG = Rig(boresight=(0.0, 1.0, 0.0), pivot=(0.0, -0.3, 0.0))
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first half of the paper's walk, seed 1."""
+    """The first third of the paper's walk, seed 1."""
     path = tmp_path_factory.mktemp("walk") / "swing_1.mcap"
-    simulate.walk(output=path, scenario="swing", seed=1, duration=18.0)
+    simulate.walk(output=path, scenario="swing", seed=1, duration=12.0)
     return path
 
 

@@ -48,7 +48,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("walks")
     paths = [folder / "swing_1.mcap", folder / "stops_2.mcap"]
     for seed, path in enumerate(paths, start=1):
-        simulate.walk(output=path, scenario=path.stem.partition("_")[0], seed=seed, duration=5.0)
+        simulate.walk(output=path, scenario=path.stem.partition("_")[0], seed=seed, duration=4.0)
     return paths
 
 
