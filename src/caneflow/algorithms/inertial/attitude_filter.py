@@ -16,7 +16,7 @@ World: x east, y magnetic north, z up.
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeVar, cast
+from typing import TypeVar, cast
 
 from caneflow.algorithms.inertial.attitude_recovery import (
     FIELD_ERROR,
@@ -25,6 +25,7 @@ from caneflow.algorithms.inertial.attitude_recovery import (
     Holes,
     Recovery,
     alike,
+    covariance_sum,
     largest_spread,
 )
 from caneflow.algorithms.inertial.gyro_bias import (
@@ -42,12 +43,11 @@ from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, leve
 from caneflow.algorithms.inertial.magnetic_heading import MagneticHeading, MagneticHeadingSettings
 from caneflow.algorithms.inertial.magnetometer_lag import MagnetometerLag
 from caneflow.algorithms.inertial.mean_force import ForceWander
-from caneflow.algorithms.inertial.unseen_turn import UnseenTurn, turned_about
+from caneflow.algorithms.inertial.unseen_turn import Bridged, UnseenTurn, turned_about
 from caneflow.algorithms.quantities import Time
 from caneflow.algorithms.rotations import (
     Quaternion,
     Vector,
-    conjugate,
     from_rotation_vector,
     from_yaw,
     multiply,
@@ -86,7 +86,7 @@ class AttitudeFilter:
         self._opened = 0.0  # s, by which the variance of yaw was opened for it
         self._unseen = UnseenTurn()
         self._wander = ForceWander()
-        self._bridged: _Bridged | None = None  # until the turn in the last hole is known better
+        self._bridged: Bridged | None = None  # until the turn in the last hole is known better
 
     @property
     def gaps(self) -> int:
@@ -160,9 +160,9 @@ class AttitudeFilter:
             attitude = self._turned(before, (0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz)), interval)
         elif spread == 0.0:  # a sensor that is always that slow
             spread = math.inf
-        self._bridged = _Bridged(before, attitude, interval, unknown)
+        self._bridged = Bridged(before, attitude, interval, unknown)
         if spread > SMALLEST or unknown is not None:
-            self._begin_recovery(_sum(alike(spread), unknown))
+            self._begin_recovery(covariance_sum(alike(spread), unknown))
             interval = 0.0
         return attitude, interval
 
@@ -171,18 +171,14 @@ class AttitudeFilter:
         found = self._unseen.found()
         if found is None or self._bridged is None:
             return attitude
-        before, bridged, lasted, unknown = self._bridged
-        bx, by, bz = self._bias.bias
-        drift = from_rotation_vector((-lasted * bx, -lasted * by, -lasted * bz))
-        missing = multiply(multiply(multiply(before, found.turn), drift), conjugate(bridged))
-        self._bridged = None
+        bridged, self._bridged = self._bridged, None
         if self._recovery is not None:
             self._recovery = None
             self._heading.close(self._opened)
-            covariance = _sum(turned_about(before, found.covariance), unknown)
+            covariance = covariance_sum(turned_about(bridged.before, found.covariance), bridged.unknown)
             if largest_spread(covariance) > SMALLEST:
                 self._begin_recovery(covariance)
-        return normalized(multiply(missing, attitude))
+        return normalized(multiply(bridged.missing(found, self._bias.bias), attitude))
 
     def _turned(self, attitude: Quaternion, rate: Vector, interval: float) -> Quaternion:
         """At a turn rate (rad/s), less the bias."""
@@ -271,20 +267,6 @@ class AttitudeFilter:
 
     def _with_yaw(self, attitude: Quaternion) -> Quaternion:
         return normalized(multiply(from_yaw(self._heading.offset), attitude))
-
-
-def _sum(one: Covariance | None, other: Covariance | None) -> Covariance | None:
-    """Of the hole's own turn, None where it may be any, and of what was unknown before, if anything was."""
-    return one if one is None or other is None else one + other
-
-
-class _Bridged(NamedTuple):
-    """The attitudes at both ends of a hole, as they were taken, and how long it was."""
-
-    before: Quaternion
-    after: Quaternion
-    lasted: float  # s
-    unknown: Covariance | None  # of the attitude before, after another hole
 
 
 class _Gravity:

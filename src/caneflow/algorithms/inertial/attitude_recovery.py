@@ -103,6 +103,11 @@ def alike(spread: float) -> Covariance | None:
     return None if math.isinf(spread) else spread * spread * np.eye(3)
 
 
+def covariance_sum(one: Covariance | None, other: Covariance | None) -> Covariance | None:
+    """Of a hole's own turn, None where it may be any, and of what was unknown before, None where nothing was."""
+    return one if one is None or other is None else one + other
+
+
 def largest_spread(covariance: Covariance | None) -> float:
     """rad, about the least known of the three axes; infinite without one."""
     return math.inf if covariance is None else math.sqrt(float(np.diag(covariance).max()))

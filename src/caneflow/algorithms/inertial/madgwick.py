@@ -5,7 +5,8 @@ descent algorithm", ICORR 2011: the filter that the room paper's IMU runs. The e
 internal report of 2010 with the longer derivation. Two things differ: the world has y, not x, at magnetic north
 (a turn by 90 degrees, which the filter does not notice), and it starts from the first reading instead of from
 the identity. A third: its gain corrects 5 degrees per second, so that an attitude that a hole in the samples has
-turned would stay wrong for long, or for good; for some seconds after one, attitude_recovery corrects it instead.
+turned would stay wrong for long, or for good; for some seconds after one, attitude_recovery corrects it instead,
+from the turn that unseen_turn has learnt of the seconds before. Without holes the filter is the printed one.
 """
 
 import math
@@ -14,14 +15,19 @@ from dataclasses import dataclass
 from caneflow.algorithms.inertial.attitude_recovery import (
     LEAST_LEVEL,
     SMALLEST,
+    Covariance,
     Holes,
     Recovery,
     UndisturbedField,
     alike,
+    covariance_sum,
+    largest_spread,
 )
 from caneflow.algorithms.inertial.imu_sample import LONGEST_INTERVAL, SampleClock
 from caneflow.algorithms.inertial.initial_attitude import AttitudeEstimate, initial_attitude, required_start
+from caneflow.algorithms.inertial.magnetometer_lag import MagnetometerLag
 from caneflow.algorithms.inertial.mean_force import TiltError
+from caneflow.algorithms.inertial.unseen_turn import Bridged, UnseenTurn, turned_about
 from caneflow.algorithms.quantities import Density, TurnRate, Zero
 from caneflow.algorithms.rotations import (
     Quaternion,
@@ -58,6 +64,10 @@ class Madgwick:
         self._gyro: Vector = (0.0, 0.0, 0.0)  # rad/s, of the sample before
         self._holes = Holes()
         self._recovery: Recovery | None = None  # since the last hole
+        self._unseen = UnseenTurn()
+        self._bridged: Bridged | None = None  # until the turn in the last hole is known
+        self._unknown: Covariance | None = None  # of the attitude before the last hole, after another one
+        self._lag = MagnetometerLag()  # taken off in a recovery, where a second of the field counts
         self._field = (0.0, 0.0)  # horizontal and vertical, mean of what was read
         self._field_time = 0.0  # s, that it has been averaged over
 
@@ -79,41 +89,66 @@ class Madgwick:
             return AttitudeEstimate(start, self._bias)
         interval = self._clock.interval(stamp_ns)
         assert interval is not None  # the clock has had its first stamp
-        hole = self._is_hole(interval, gyro, accel)
-        if interval <= LONGEST_INTERVAL:
-            self._orientation = self._turned(self._orientation, gyro, accel, mag, interval, hole=hole)
+        if self._is_hole(interval, gyro, accel):
+            self._orientation = self._over_hole(self._orientation, gyro, interval)
+        elif interval <= LONGEST_INTERVAL:
+            self._orientation = self._turned(self._orientation, gyro, accel, mag, interval)
         self._gyro = gyro
         if self._recovery is not None:
             recovery = self._recovery
+            mag = None if mag is None else self._lag.taken_off(mag, gyro)
             return AttitudeEstimate(self._recovered(recovery, accel, mag, interval), self._bias, recovery.spread)
         return AttitudeEstimate(self._orientation, self._bias)
 
     def _turned(
-        self, q: Quaternion, gyro: Vector, accel: Vector | None, mag: Vector | None, interval: float, *, hole: bool
+        self, q: Quaternion, gyro: Vector, accel: Vector | None, mag: Vector | None, interval: float
     ) -> Quaternion:
-        if hole:
-            return self._bridged(q, gyro, interval)
+        self._unseen.take(interval, gyro)
+        q = self._with_turn_found(q)
         if self._recovery is not None:
             return self._advanced(q, gyro, None, None, interval)
         q = self._advanced(q, gyro, accel, mag, interval)
-        self._remember_field(q, mag, interval)
+        self._remember_field(q, gyro, mag, interval)
         return q
 
     def _is_hole(self, interval: float, gyro: Vector, accel: Vector | None) -> bool:
         """Whether samples are missing; where that may matter, a recovery begins."""
         spread = self._holes.spread(interval, gyro, accel)
-        if spread > SMALLEST or (spread > 0.0 and self._recovery is not None):
-            if self._recovery is not None:
-                spread = math.hypot(spread, self._recovery.spread)
-                self._end_recovery(self._recovery)
-            self._recovery = Recovery(alike(spread), TiltError(self._holes.speed), self._undisturbed())
-        return spread > 0.0
+        if spread == 0.0:
+            return False
+        self._unknown = None
+        if self._recovery is not None:
+            self._unknown = self._recovery.covariance
+            self._end_recovery(self._recovery)
+        self._unseen.begin(interval)
+        if spread > SMALLEST or self._unknown is not None:
+            self._begin_recovery(covariance_sum(alike(spread), self._unknown))
+        return True
 
-    def _bridged(self, q: Quaternion, gyro: Vector, interval: float) -> Quaternion:
-        """Over a hole by the mean of the readings at both ends; Madgwick's own step is for small turns."""
+    def _begin_recovery(self, covariance: Covariance | None) -> None:
+        self._lag.restart()
+        self._recovery = Recovery(covariance, TiltError(self._holes.speed), self._undisturbed())
+
+    def _over_hole(self, q: Quaternion, gyro: Vector, interval: float) -> Quaternion:
+        """By the mean of the readings at both ends, until it is known how they went on changing."""
         (ax, ay, az), (x, y, z), (bx, by, bz) = self._gyro, gyro, self._bias
         turn = interval * (0.5 * (ax + x) - bx), interval * (0.5 * (ay + y) - by), interval * (0.5 * (az + z) - bz)
-        return normalized(multiply(q, from_rotation_vector(turn)))
+        after = normalized(multiply(q, from_rotation_vector(turn))) if interval <= LONGEST_INTERVAL else q
+        self._bridged = Bridged(q, after, interval, self._unknown)
+        return after
+
+    def _with_turn_found(self, q: Quaternion) -> Quaternion:
+        """The attitude, with the turn in the last hole as it is known now, if it has just become known."""
+        found = self._unseen.found()
+        if found is None or self._bridged is None:
+            return q
+        bridged, self._bridged = self._bridged, None
+        if self._recovery is not None:
+            self._recovery = None
+            covariance = covariance_sum(turned_about(bridged.before, found.covariance), bridged.unknown)
+            if largest_spread(covariance) > SMALLEST:
+                self._begin_recovery(covariance)
+        return normalized(multiply(bridged.missing(found, self._bias), q))
 
     def _recovered(self, recovery: Recovery, accel: Vector | None, mag: Vector | None, interval: float) -> Quaternion:
         """The gyro's attitude with what was found of the turn in the hole."""
@@ -129,9 +164,10 @@ class Madgwick:
         self._orientation = normalized(multiply(recovery.turn, self._orientation))
         self._recovery = None
 
-    def _remember_field(self, q: Quaternion, mag: Vector | None, interval: float) -> None:
+    def _remember_field(self, q: Quaternion, gyro: Vector, mag: Vector | None, interval: float) -> None:
         if mag is None:
             return
+        self._lag.learn(rotate(q, mag), rotate(q, gyro), interval)
         east, north, vertical = rotate(q, mag)
         self._field_time = min(self._field_time + interval, FIELD_MEMORY)
         share, (level, up) = interval / self._field_time, self._field

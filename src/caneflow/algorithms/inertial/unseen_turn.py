@@ -17,6 +17,7 @@ from caneflow.algorithms.rotations import (
     IDENTITY,
     Quaternion,
     Vector,
+    conjugate,
     from_rotation_vector,
     multiply,
     normalized,
@@ -24,6 +25,8 @@ from caneflow.algorithms.rotations import (
 )
 
 Array: TypeAlias = npt.NDArray[np.float64]
+# Time (s) and the turn rates' sums since the start (rad); plain, as names would be two thirds of a snapshot
+_Knot: TypeAlias = tuple[float, float, float, float]
 
 KNOT = 0.01  # s, between which turn rates are averaged
 REMEMBERED = 450  # knots before the hole
@@ -42,11 +45,19 @@ class TurnFound(NamedTuple):
     covariance: Array  # (3, 3) rad^2, of a small rotation in the body as it was at the hole's begin
 
 
-class _Knot(NamedTuple):
-    time: float  # s
-    x: float  # rad, sum since the start
-    y: float
-    z: float
+class Bridged(NamedTuple):
+    """The attitudes at both ends of a hole, as they were taken, and how long it was."""
+
+    before: Quaternion
+    after: Quaternion
+    lasted: float  # s
+    unknown: Array | None  # (3, 3) rad^2, of the attitude before, after another hole
+
+    def missing(self, found: TurnFound, bias: Vector) -> Quaternion:
+        """The rotation of the world that is missing since then; `bias` of the gyro in rad/s."""
+        x, y, z = bias
+        drift = from_rotation_vector((-self.lasted * x, -self.lasted * y, -self.lasted * z))
+        return multiply(multiply(multiply(self.before, found.turn), drift), conjugate(self.after))
 
 
 class _Hole(NamedTuple):
@@ -61,7 +72,7 @@ class UnseenTurn:
 
     def __init__(self) -> None:
         self._knots: deque[_Knot] = deque(maxlen=REMEMBERED)
-        self._now = _Knot(0.0, 0.0, 0.0, 0.0)
+        self._now: _Knot = (0.0, 0.0, 0.0, 0.0)
         self._next = KNOT  # s, of the next knot
         self._hole: _Hole | None = None
         self._ended = 0.0  # s, of the hole
@@ -70,10 +81,10 @@ class UnseenTurn:
         """A reading (rad/s), which counts for the usual `interval` (s) before it."""
         p, q, r = gyro
         time, x, y, z = self._now
-        self._now = _Knot(time + interval, x + interval * p, y + interval * q, z + interval * r)
-        while self._next <= self._now.time:
+        self._now = time + interval, x + interval * p, y + interval * q, z + interval * r
+        while self._next <= self._now[0]:
             since = self._next - time
-            self._knots.append(_Knot(self._next, x + since * p, y + since * q, z + since * r))
+            self._knots.append((self._next, x + since * p, y + since * q, z + since * r))
             self._next += KNOT
 
     def begin(self, interval: float) -> None:
@@ -84,18 +95,18 @@ class UnseenTurn:
         else:
             self._knots.append(self._now)
             self._hole = _learnt(np.array(self._knots), interval)
-        self._ended = self._now.time + interval
-        self._now = self._now._replace(time=self._ended)
+        self._ended = self._now[0] + interval
+        self._now = (self._ended, *self._now[1:])
         self._next = self._ended + KNOT
         self._knots.append(self._now)
 
     def found(self) -> TurnFound | None:
         """The turn in the last hole, once: when enough has been read since."""
         hole = self._hole
-        if hole is None or self._now.time < self._ended + AFTER * hole.width:
+        if hole is None or self._now[0] < self._ended + AFTER * hole.width:
             return None
         self._hole = None
-        knots = np.array([knot for knot in self._knots if knot.time >= self._ended] + [self._now])
+        knots = np.array([knot for knot in self._knots if knot[0] >= self._ended] + [self._now])
         after = _rates(knots, self._ended + hole.width * np.arange(AFTER + 1.0))
         rates = hole.weights.T @ np.concatenate((hole.before, after))
         return _course(rates, hole.width, hole.squares)
