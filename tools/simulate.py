@@ -1,7 +1,7 @@
 """`caneflow simulate`: recordings of walks that nobody walked, with the truth beside them."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +12,17 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from caneflow.messages import DopplerBlock, Imu, Pose, RadarFrame, Ranges, Sample, numbered, sample_key
+from caneflow.messages import DopplerBlock, Imu, Pose, RadarFrame, RadarPoints, Ranges, Sample, numbered, sample_key
 from caneflow.options import Overwrite
 from caneflow.outputs import made_folder, require_free, whole
+from caneflow.protocols import a121 as a121_chip
 from caneflow.recording import TRUTH, RecordingWriter
+from caneflow.simulation.a121 import A121Settings
 from caneflow.simulation.doppler_module import Kind
 from caneflow.simulation.guided_walk import RANGERS, GuidedWalk, simulate_guided_walk
+from caneflow.simulation.mmwave import MmwaveSettings
 from caneflow.simulation.obstacle_course import SceneKind, ThingKind
+from caneflow.simulation.radar_walk import Floor, RadarWalk, simulate_a121_walk, simulate_mmwave_walk
 from caneflow.simulation.ranger import Readings
 from caneflow.simulation.room_cane import CaneInRoom, simulate_cane_in_room
 from caneflow.simulation.room_course import RoomShape
@@ -27,8 +31,9 @@ from caneflow.simulation.scenario import SCENARIOS, Walk, WalkSettings, simulate
 
 RECORDING = ".mcap"  # the end of a file's name; another output of `simulate room` is a folder
 CANE, ROOM, CANE_IN_ROOM = "cane", "room", "cane_in_room"  # flows
+CANE_A121, CANE_MMWAVE = "cane_a121", "cane_mmwave"  # likewise
 REAL = "What recordings of real devices have"  # options under one heading of the help
-IMU, RADAR = ("imu", "imu"), ("radar", "frame")
+IMU, RADAR, POINTS = ("imu", "imu"), ("radar", "frame"), ("radar", "points")
 
 Samples: TypeAlias = Iterator[tuple[tuple[str, str], int, Sample]]  # node and port, number within the stream, sample
 
@@ -143,6 +148,16 @@ def walk(
             rich_help_panel=REAL,
         ),
     ] = None,
+    radar: Annotated[
+        Literal["p440", "a121", "mmwave"],
+        typer.Option(
+            help="Another radar in the P440's place: an A121 low on the shaft, or a TI radar that looks ahead."
+        ),
+    ] = "p440",
+    floor: Annotated[
+        Floor | None,
+        typer.Option(help="What the A121 looks at: -15, -20, -25, -30 dB of reflectivity; by default usual, -20."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate a walk with a white cane: IMU and radar at 100 Hz, and where the cane truly was.
@@ -154,6 +169,8 @@ def walk(
     Example: caneflow simulate walk --scenario stops --seed 3 -o stops_3.mcap
 
     Example: caneflow simulate walk --scene approach --thing pole --seed 3 -o pole_3.mcap
+
+    Example: caneflow simulate walk --radar a121 --floor smooth --seed 3 -o smooth_3.mcap
     """
     faults = {
         "noise_rise": noise_rise,
@@ -168,6 +185,11 @@ def walk(
         "field_wander": None if field_wander is None else math.radians(field_wander),
     }
     asked = {name: value for name, value in faults.items() if value is not None}
+    if floor is not None and radar != "a121":
+        raise typer.BadParameter("goes with --radar a121: only its echoes have an absolute power", param_hint="--floor")
+    if radar != "p440" and (asked or scene is not None):
+        other = "scene" if scene is not None else next(iter(asked)).replace("_", "-")
+        raise typer.BadParameter(f"goes with --radar p440 only, not {radar}", param_hint=f"--{other}")
     if scene is not None:
         if asked:
             raise typer.BadParameter("a scene has none of it", param_hint=f"--{next(iter(asked)).replace('_', '-')}")
@@ -180,6 +202,9 @@ def walk(
     scenario = scenario or "swing"
     if scenario not in SCENARIOS:
         raise typer.BadParameter(f"no walk {scenario!r}; there are {', '.join(SCENARIOS)}", param_hint="--scenario")
+    if radar != "p440":
+        other_radar_walk(output, scenario, seed, radar, floor or "usual", duration, overwrite=overwrite)
+        return
     with whole(output, overwrite=overwrite) as recording:
         with progress_bar(f"{scenario}, seed {seed}") as progress:
             walked = simulate_walk(_with_faults(walk_settings(scenario, seed), asked), seed, duration, progress)
@@ -195,6 +220,31 @@ def _with_faults(settings: WalkSettings, asked: Mapping[str, float]) -> WalkSett
         own = {name: value for name, value in asked.items() if hasattr(before, name)}
         settings = replace(settings, **{part: replace(before, **own)})
     return settings
+
+
+def other_radar_walk(
+    output: Path,
+    scenario: str,
+    seed: int,
+    radar: Literal["a121", "mmwave"],
+    floor: Floor,
+    duration: float | None,
+    *,
+    overwrite: bool,
+) -> None:
+    """Write a walk with another radar than the P440."""
+    settings = walk_settings(scenario, seed)
+    shown = f"{scenario}, {radar}, seed {seed}"
+    with whole(output, overwrite=overwrite) as recording, progress_bar(shown) as progress:
+        if radar == "a121":
+            walked = simulate_a121_walk(settings, seed, floor, duration=duration, progress=progress)
+            written(recording, CANE_A121, walked.rig, a121_samples(walked))
+        else:
+            walked = simulate_mmwave_walk(settings, seed, duration=duration)
+            written(recording, CANE_MMWAVE, walked.rig, mmwave_samples(walked))
+    seconds = float(walked.stamps_ns[-1] - walked.stamps_ns[0]) / 1e9
+    frames = len(walked.points) if walked.sweeps is None else len(walked.sweeps[0])
+    print(f"{output}: {scenario}, {radar}, seed {seed}: {frames} frames, {seconds:.2f} s")
 
 
 def guided_walk(
@@ -361,21 +411,9 @@ def came(walked: Walk, name: tuple[str, str], i: int) -> bool:
 
 def cane_samples(walked: Walk, i: int) -> Samples:
     """What the cane's IMU and radar say at instant `i`."""
-    imu, stamp = walked.imu, int(walked.stamps_ns[i])
+    stamp = int(walked.stamps_ns[i])
     imu_stamp = stamp if walked.received is None else int(walked.received.imu_stamps_ns[i])
-    yield (
-        IMU,
-        i,
-        Imu(
-            stamp=imu_stamp,
-            gyro=tuple(imu.gyro[i].tolist()),
-            accel=tuple(imu.accel[i].tolist()),
-            mag=tuple(imu.mag[i].tolist()),
-            orientation=tuple(imu.orientation[i].tolist()),
-            linear_accel=tuple(imu.linear_accel[i].tolist()),
-            calibration=tuple(imu.calibration[i].tolist()),
-        ),
-    )
+    yield IMU, i, imu_sample(walked, i, imu_stamp)
     yield (
         RADAR,
         i,
@@ -389,6 +427,71 @@ def cane_samples(walked: Walk, i: int) -> Samples:
             bandwidth=walked.bandwidth,
         ),
     )
+
+
+def imu_sample(walked: Walk | RadarWalk, i: int, stamp: int) -> Imu:
+    """What the cane's IMU says at instant `i`."""
+    imu = walked.imu
+    return Imu(
+        stamp=stamp,
+        gyro=tuple(imu.gyro[i].tolist()),
+        accel=tuple(imu.accel[i].tolist()),
+        mag=tuple(imu.mag[i].tolist()),
+        orientation=tuple(imu.orientation[i].tolist()),
+        linear_accel=tuple(imu.linear_accel[i].tolist()),
+        calibration=tuple(imu.calibration[i].tolist()),
+    )
+
+
+def a121_samples(walked: RadarWalk) -> Samples:
+    """What the IMU and an A121 say, and the truth, in the order of the stamps."""
+    assert walked.sweeps is not None
+    times, frames = walked.sweeps
+    settings = A121Settings()
+    axis = a121_chip.range_axis(settings.setup.start_point, settings.setup.step_length)
+    begin = int(walked.stamps_ns[0])
+    radar: list[Sample] = [
+        RadarFrame(
+            stamp=begin + round(1e9 * time),
+            scans=scans,
+            scan_period=1.0 / settings.setup.sweep_rate,
+            range_start=axis.start,
+            range_step=axis.step,
+            carrier=a121_chip.CARRIER,
+            bandwidth=a121_chip.bandwidth_of(settings.setup.profile),
+        )
+        for time, scans in zip(times.tolist(), frames, strict=True)
+    ]
+    yield from _beside(walked, RADAR, radar)
+
+
+def mmwave_samples(walked: RadarWalk) -> Samples:
+    """What the IMU and a TI radar say, and the truth, in the order of the stamps."""
+    settings, begin = MmwaveSettings(), int(walked.stamps_ns[0])
+    radar: list[Sample] = [
+        RadarPoints(
+            stamp=begin + round(1e9 * frame.time),
+            position=frame.position.astype("float32"),
+            doppler=frame.doppler.astype("float32"),
+            snr=frame.snr.astype("float32"),
+            frame_time=settings.frame_time,
+            doppler_step=settings.doppler_step,
+            doppler_limit=settings.doppler_limit,
+        )
+        for frame in walked.points
+    ]
+    yield from _beside(walked, POINTS, radar)
+
+
+def _beside(walked: RadarWalk, name: tuple[str, str], radar: Sequence[Sample]) -> Samples:
+    """A radar's samples among those of the IMU and the truth."""
+    next_one = 0
+    for i, stamp in enumerate(walked.stamps_ns.tolist()):
+        while next_one < len(radar) and radar[next_one].stamp < stamp:
+            yield name, next_one, radar[next_one]
+            next_one += 1
+        yield IMU, i, imu_sample(walked, i, stamp)
+        yield TRUTH, i, true_pose(walked, i)
 
 
 def cane_in_room_samples(walked: CaneInRoom) -> Samples:
@@ -439,7 +542,7 @@ def module_samples(recorded: RoomRecording, block: int) -> Samples:
         )
 
 
-def true_pose(simulated: Walk | RoomRecording, i: int) -> Pose:
+def true_pose(simulated: Walk | RadarWalk | RoomRecording, i: int) -> Pose:
     """Where it truly was at instant `i`."""
     return Pose(
         stamp=int(simulated.stamps_ns[i]),

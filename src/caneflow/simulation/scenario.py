@@ -73,7 +73,7 @@ def simulate_walk(
     settings = walk_settings(scenario, seed) if isinstance(scenario, str) else scenario
     if duration is not None and not duration > 0.0:
         raise ValueError(f"a walk of {duration} s; the duration must be > 0 s")
-    _, person_rng, scene_rng, radar_rng, imu_rng, faults_rng = _generators(seed)
+    _, person_rng, scene_rng, radar_rng, imu_rng, faults_rng = generators(seed)
     faults = settings.faults
     glitch_rng, received_rng, rig_rng = faults_rng.spawn(3)
     radar = replace(settings.radar, carrier=settings.radar.carrier / (1.0 + faults.carrier_off))
@@ -104,10 +104,10 @@ def walk_settings(scenario: str, seed: int) -> WalkSettings:
     """What a named scenario is for a seed; raises ValueError for a name that is not there or a negative seed."""
     if scenario not in SCENARIOS:
         raise ValueError(f"no walk '{scenario}'; there are {', '.join(SCENARIOS)}")
-    return SCENARIOS[scenario](_generators(seed)[0])
+    return SCENARIOS[scenario](generators(seed)[0])
 
 
-def _generators(seed: int) -> list[Generator]:
+def generators(seed: int) -> list[Generator]:
     """Of the scenario, the person, the scene, the radar, the IMU and the faults."""
     if seed < 0:
         raise ValueError(f"seed {seed}; it must be 0 or more")
