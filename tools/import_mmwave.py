@@ -1,6 +1,5 @@
 """`caneflow import mmwave`: a recording of a raw dump of a TI mmWave radar's data port."""
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from caneflow.algorithms.radar.doppler_bins import doppler_bins
 from caneflow.errors import CaneflowError
 from caneflow.messages import NAME, NAME_RULE, RadarPoints, numbered, sample_key
 from caneflow.options import Overwrite
@@ -105,15 +105,11 @@ def _told(file: Path, packets: Sequence[Packet]) -> Chirps:
         raise CaneflowError(
             f"{file}: of SDK 1, whose Dopplers are numbers of bins: give its configuration, --config CFG"
         )
-    speeds = np.abs(np.concatenate([packet.doppler for packet in packets])).astype(np.float64)
-    moving = speeds[speeds > 1e-4]
-    if not len(moving):
+    bins = doppler_bins(np.concatenate([packet.doppler for packet in packets]))
+    if bins is None:
         raise CaneflowError(f"{file}: nothing in it moves, so that its Doppler steps are not known: --config CFG")
-    least = float(moving.min())
-    step = float(np.median(moving / np.rint(moving / least)))
-    limit = step * 2.0 ** max(math.ceil(math.log2(float(moving.max()) / step - 1e-3)), 2)
     carrier = CARRIERS.get(packets[0].platform >> 8, CARRIER)
-    return Chirps(limit, step, SPEED_OF_LIGHT / carrier / (2.0 * step), _period(file, packets))
+    return Chirps(bins.limit, bins.step, SPEED_OF_LIGHT / carrier / (2.0 * bins.step), _period(file, packets))
 
 
 def _period(file: Path, packets: Sequence[Packet]) -> float:

@@ -3,14 +3,18 @@
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import typer
 
+from caneflow.algorithms.radar.doppler_bins import doppler_bins
 from caneflow.algorithms.rotations import Quaternion, conjugate
 from caneflow.bridges.errors import BridgeError
 from caneflow.bridges.frames import RADAR, Transform
+from caneflow.bridges.point_clouds import CLOUD_TYPE, DOPPLER, Bins, cloud_of, doppler_of, has_doppler
 from caneflow.bridges.ros_messages import IMU_TYPE, MAG_TYPE, ODOMETRY_TYPE, TF_STATIC
 from caneflow.bridges.ros_samples import (
     FieldsByTime,
@@ -18,6 +22,7 @@ from caneflow.bridges.ros_samples import (
     field_of,
     frame_of,
     imu_of,
+    points_rig_of,
     pose_of,
     rig_of,
     stamp_of,
@@ -28,12 +33,16 @@ from caneflow.messages import NAME, NAME_RULE, Sample, numbered, sample_key
 from caneflow.messages.rig import overlaid
 from caneflow.options import Overwrite
 from caneflow.outputs import whole
+from caneflow.physics import SPEED_OF_LIGHT
 from caneflow.recording import TRUTH, RecordingWriter
 from caneflow.runtime.dataflow.loading import read_rig
 
 PAIR_WITHIN = 20_000_000  # ns between an IMU's sample and the magnetic field that is taken with it
 UNSET = 86_400_000_000_000  # ns: a stamp of 0 in a bag of a later day was never set
-IMU_STREAM = ("imu", "imu")
+IMU_STREAM, POINTS_STREAM = ("imu", "imu"), ("radar", "points")
+CARRIER = 60.25e9  # Hz, by which the length of a frame is told from its Doppler steps; at 77 GHz it is 4 ms of 20 less
+STILL_STEP, STILL_LIMIT = 0.1, 3.0  # m/s, where nothing moved
+LONGEST_FRAME = 0.1  # s
 
 
 def rosbag(
@@ -54,6 +63,15 @@ def rosbag(
         str | None,
         typer.Option(metavar="TOPIC", help="nav_msgs/Odometry to take as ground truth; by default none."),
     ] = None,
+    points: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC", help="sensor_msgs/PointCloud2 with Doppler to take; by default the only one that has it."
+        ),
+    ] = None,
+    approaching: Annotated[
+        bool, typer.Option("--approaching", help="The clouds' Doppler is positive for what approaches, not recedes.")
+    ] = False,
     rig: Annotated[Path | None, typer.Option(metavar="YAML", help="Rig to store in the recording.")] = None,
     distro: Annotated[
         str, typer.Option(help=f"Definitions to use where the bag has none: {', '.join(DISTROS)}.")
@@ -61,7 +79,7 @@ def rosbag(
     flow: Annotated[str, typer.Option(help="Flow under whose name it is recorded.")] = "cane",
     overwrite: Overwrite = False,
 ) -> None:
-    """Make a recording of a bag: its IMU as imu/imu, an odometry as truth/pose.
+    """Make a recording of a bag: its IMU as imu/imu, a radar's points as radar/points, an odometry as truth/pose.
 
     Stamps are those of the messages' headers. The body frame is the IMU's own; magnetic fields and truth are brought
     into it by the bag's /tf_static. Topics that are not used are listed, and so are messages that cannot be used.
@@ -74,15 +92,19 @@ def rosbag(
         raise CaneflowError(f"--distro {distro!r}: expected one of {', '.join(DISTROS)}")
     laid_over = {} if rig is None else read_rig(rig)
     with whole(output, inputs=[bag, rig], overwrite=overwrite) as path, _opened(bag, distro) as reader:
-        topics = Topics(bag, reader)
+        topics, opened = Topics(bag, reader), Bag(bag, reader)
         chosen = Chosen(
             topics.only(IMU_TYPE, "--imu", imu),
             topics.only(MAG_TYPE, "--mag", mag),
             topics.only(ODOMETRY_TYPE, "--truth", truth) if truth else None,
+            _cloud_topic(topics, opened, points),
         )
-        if chosen.imu is None and chosen.truth is None:
-            raise CaneflowError(f"{bag}: holds no {IMU_TYPE}, and no --truth is named; there are {topics.listed()}")
-        lines = _write(path, flow, Bag(bag, reader), chosen, laid_over)
+        if not any((chosen.imu, chosen.truth, chosen.points)):
+            raise CaneflowError(
+                f"{bag}: holds no {IMU_TYPE} and no radar's points, and no --truth is named; "
+                f"there are {topics.listed()}"
+            )
+        lines = _write(path, flow, opened, chosen, laid_over, approaching=approaching)
     print(f"{output}: {lines[0]}")
     for line in [*lines[1:], *topics.unused(chosen)]:
         print(line)
@@ -94,6 +116,7 @@ class Chosen(NamedTuple):
     imu: str | None
     mag: str | None
     truth: str | None
+    points: str | None
 
 
 class Topics:
@@ -106,7 +129,7 @@ class Topics:
 
     def only(self, kind: str, option: str, wanted: str | None) -> str | None:
         """The topic `wanted`, or the only one of `kind`; raises CaneflowError when it is of another, or of several."""
-        there = sorted(topic for topic, its in self._kinds.items() if its == kind and self._counts[topic])
+        there = self.of(kind)
         if wanted is not None and wanted not in there:
             found = f"is {self._kinds[wanted]}" if wanted in self._kinds else "no such topic"
             raise CaneflowError(
@@ -117,6 +140,10 @@ class Topics:
                 f"{self._path}: {len(there)} topics of {kind}; choose one with {option}: {', '.join(there)}"
             )
         return wanted or next(iter(there), None)
+
+    def of(self, kind: str) -> list[str]:
+        """The topics of a kind that hold something."""
+        return sorted(topic for topic, its in self._kinds.items() if its == kind and self._counts[topic])
 
     def listed(self) -> str:
         """All topics with their types, for a line."""
@@ -133,8 +160,12 @@ class Bag:
     """The messages of a bag, decoded."""
 
     def __init__(self, path: Path, reader: Any) -> None:
-        self._path = path
+        self.path = path
         self._reader = reader
+
+    def first(self, topic: str) -> list[Any]:
+        """The first message of a topic; none where there is none."""
+        return [message for _, _, message in islice(self.messages(topic), 1)]
 
     def messages(self, *topics: str | None) -> Iterator[tuple[str, int, Any]]:
         """Topic, the bag's own time (ns) and message; raises BridgeError where the bag is damaged."""
@@ -147,7 +178,22 @@ class Bag:
         except CaneflowError:
             raise
         except Exception as error:  # readers of damaged files raise whatever they stumble over
-            raise BridgeError(f"{self._path}: cannot be read further: {type(error).__name__}: {error}") from error
+            raise BridgeError(f"{self.path}: cannot be read further: {type(error).__name__}: {error}") from error
+
+
+def _cloud_topic(topics: Topics, bag: Bag, wanted: str | None) -> str | None:
+    """The topic of clouds that is taken; raises CaneflowError for one without Doppler, and when several have it."""
+    if wanted is not None:
+        topics.only(CLOUD_TYPE, "--points", wanted)
+    with_doppler = [topic for topic in topics.of(CLOUD_TYPE) if any(map(has_doppler, bag.first(topic)))]
+    if wanted is not None and wanted not in with_doppler:
+        raise CaneflowError(f"{bag.path}: --points {wanted}: has no field of Doppler; known are {', '.join(DOPPLER)}")
+    if wanted is None and len(with_doppler) > 1:
+        raise CaneflowError(
+            f"{bag.path}: {len(with_doppler)} topics of points with Doppler; choose one with --points: "
+            f"{', '.join(with_doppler)}"
+        )
+    return wanted or next(iter(with_doppler), None)
 
 
 @contextmanager
@@ -204,7 +250,9 @@ class _Stream:
             yield f"{self.name}: {count} messages left out: {cause}"
 
 
-def _write(path: Path, flow: str, bag: Bag, chosen: Chosen, laid_over: dict[str, Any]) -> list[str]:
+def _write(
+    path: Path, flow: str, bag: Bag, chosen: Chosen, laid_over: dict[str, Any], *, approaching: bool
+) -> list[str]:
     """Write the recording; what there is to say of it, the counts first."""
     fixed = FixedFrames()
     for _, _, message in bag.messages(TF_STATIC):
@@ -216,15 +264,23 @@ def _write(path: Path, flow: str, bag: Bag, chosen: Chosen, laid_over: dict[str,
         for _, _, message in bag.messages(chosen.mag)
         if (field := field_of(message, frames.turn(frame_of(message)))) is not None
     )
-    rig = overlaid(rig_of(fixed, body, RADAR) if body else {}, laid_over)
+    cloud_frame = next((frame_of(message) for message in bag.first(chosen.points)), None) if chosen.points else None
+    bins = _bins(bag, chosen.points)
+    known = rig_of(fixed, body, RADAR) if body else {}
+    if body and cloud_frame:
+        known = {**known, **points_rig_of(fixed, body, cloud_frame)}
+    rig = overlaid(known, laid_over)
     with RecordingWriter(path, flow=flow, source="imported", rig=rig) as writer:
         imu, truth = _Stream(writer, flow, IMU_STREAM), _Stream(writer, flow, TRUTH)
+        clouds = _Stream(writer, flow, POINTS_STREAM)
         with_mag = 0
-        for topic, at, message in bag.messages(chosen.imu, chosen.truth):
+        for topic, at, message in bag.messages(chosen.imu, chosen.truth, chosen.points):
             if topic == chosen.imu:
                 mag = fields.nearest(stamp_of(message), PAIR_WITHIN)
                 with_mag += mag is not None
                 imu.add(message, at, lambda message=message, mag=mag: imu_of(message, mag=mag))  # type: ignore[misc]
+            elif topic == chosen.points:
+                clouds.add(message, at, lambda message=message: made_cloud(message, bins, approaching))  # type: ignore[misc]
             else:
                 child = str(message.child_frame_id).removeprefix("/")
                 there = frames.body_in(child)
@@ -232,7 +288,32 @@ def _write(path: Path, flow: str, bag: Bag, chosen: Chosen, laid_over: dict[str,
     counts = (
         f"{imu.count} samples of the IMU, {with_mag} with a magnetic field; {truth.count} poses of the ground truth"
     )
-    return [counts, *imu.lines(), *truth.lines(), *frames.said]
+    if chosen.points:
+        counts += (
+            f"; {clouds.count} frames of a radar's points, Doppler steps of {bins.step:.3f} to {bins.limit:.2f} m/s, "
+            "told from the points"
+        )
+        if body and cloud_frame and "radar_orientation" not in rig:
+            frames.said[f"{TF_STATIC} does not say how {cloud_frame} lies on {body}: set rig.radar_orientation"] = None
+    return [counts, *imu.lines(), *clouds.lines(), *truth.lines(), *frames.said]
+
+
+def made_cloud(message: Any, bins: Bins, approaching: bool) -> Sample:
+    """The sample of a cloud; raises ValueError for one that does not add up."""
+    return cloud_of(message, stamp_of(message), bins, approaching=approaching)
+
+
+def _bins(bag: Bag, topic: str | None) -> Bins:
+    """Of the radar's Doppler, by all its points: a cloud does not say it."""
+    speeds = []
+    for _, _, message in bag.messages(topic) if topic else ():
+        try:
+            speeds.append(doppler_of(message))
+        except ValueError:  # counted when it is written
+            continue
+    found = doppler_bins(np.concatenate(speeds)) if speeds else None
+    step, limit = found or (STILL_STEP, STILL_LIMIT)
+    return Bins(min(SPEED_OF_LIGHT / CARRIER / (2.0 * step), LONGEST_FRAME), step, limit)
 
 
 class _Frames:

@@ -154,6 +154,15 @@ def rig_of(fixed: FixedFrames, body: str, radar: str) -> dict[str, Any]:
     return {"boresight": [round(x, 12) for x in boresight], "antenna": [round(x, 12) for x in antenna]}
 
 
+def points_rig_of(fixed: FixedFrames, body: str, cloud: str) -> dict[str, Any]:
+    """How the frame of a radar's clouds lies on the body, as /tf_static has it; nothing where it does not."""
+    there = fixed.between(body, cloud)
+    if there is None:
+        return {}
+    places = rig_of(fixed, body, cloud)
+    return {**places, "radar_orientation": [round(x, 12) for x in there.rotation]}
+
+
 def _covariance(message: Any, turn: Quaternion) -> Any:
     place = np.array(message.pose.covariance, float).reshape(6, 6)[:3, :3]
     motion = np.array(message.twist.covariance, float).reshape(6, 6)[:3, :3]
