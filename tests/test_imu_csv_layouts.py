@@ -84,6 +84,23 @@ def test_a_title_behind_a_mark_of_comments_is_found_as_it_is_written(title: str,
     assert gyro_stamps(f"{title},gx,gy,gz", times, mark.lstrip("#% "))[0] == EVERY_10_MS
 
 
+def test_the_first_column_of_a_data_frame_has_no_title() -> None:
+    """Pandas writes its index under an empty title: the others are not one further left."""
+    rows = [f"{i},{0.01 * i:.2f},{','.join(f'{v:.6f}' for v in rates)}" for i, rates in enumerate(GYRO)]
+    columns = {"time": "t", **told("gyro", ["gx", "gy", "gz"])}
+    found = list(Joined([ImuTable([",t,gx,gy,gz", *rows], columns=columns, units={})]).readings())
+    assert [reading.stamp for reading in found] == EVERY_10_MS
+    np.testing.assert_allclose([reading.gyro for reading in found], GYRO, atol=1e-6)
+
+
+def test_capital_letters_count_only_where_titles_differ_in_nothing_else() -> None:
+    columns = {"time": "t", **told("gyro", ["gx", "gy", "gz"])}
+    table = ImuTable(lines("T,GX,GY,GZ", TIME.tolist(), GYRO), columns=columns, units={})
+    assert table.layout.vectors["gyro"] == (1, 2, 3)
+    table = ImuTable(lines("t,GX,gx,gy,gz,x", TIME.tolist(), GYRO, GYRO[:, :2]), columns=columns, units={})
+    assert table.layout.vectors["gyro"] == (2, 3, 4)
+
+
 @pytest.mark.parametrize(("tick", "hertz"), [(1e-4, 100.0), (1e-4, 40.0), (1e-6, 60.0), (1e-6, 120.0)])
 def test_the_time_of_an_xsens_is_of_the_unit_that_makes_a_rate_of_it(tick: float, hertz: float) -> None:
     """An MTw or MTi counts 100 us under the title under which a DOT counts 1 us."""

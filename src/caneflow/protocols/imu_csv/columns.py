@@ -102,8 +102,8 @@ def _titles(row: Sequence[str]) -> tuple[str, ...]:
     titles = [title.strip() for title in row]
     if titles and titles[0].startswith(COMMENT_MARKS):
         titles[0] = titles[0].lstrip(MARKS)
-    if len(titles) > 1 and not titles[0]:
-        del titles[0]  # "# time gx": the mark was a cell of its own
+        if len(titles) > 1 and not titles[0]:
+            del titles[0]  # "# time gx": the mark was a cell of its own
     return tuple(titles)
 
 
@@ -135,11 +135,15 @@ def _resolved(
 
 
 def _index(titles: Sequence[str], name: str, wanted: str) -> int:
-    """Where a column is: by its title, by a beginning that no other has, or by its number, from 1."""
+    """Where a column is: by its title, by a beginning that no other has, or by its number, from 1.
+
+    Capital letters count where there are titles that differ in nothing else.
+    """
     if wanted not in titles and wanted.startswith(COMMENT_MARKS):
         wanted = wanted.lstrip(MARKS)  # as the first title of a header that is a comment is written
     matches = [i for i, title in enumerate(titles) if title == wanted]
     matches = matches or [i for i, title in enumerate(titles) if wanted and title.startswith(wanted)]
+    matches = matches or [i for i, title in enumerate(titles) if title.casefold() == wanted.casefold()]
     if len(matches) == 1:
         return matches[0]
     if not matches and wanted.isdigit():
