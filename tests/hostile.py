@@ -115,11 +115,11 @@ def files() -> dict[str, bytes]:
         + numbered(1000)
         + b"".join(chunk(message(1 + k % 1000, SECOND + k)) for k in range(1000)),
         "empty chunks": MAGIC + START + chunk(b"") * 5000,
-        "chunks of zeros": MAGIC + START + zeros * 6,
+        "chunks of zeros": MAGIC + START + zeros * 3,
         "a chunk of the same message": MAGIC + START + IMU + chunk(message(1, SECOND, 0, b"") * 1_500_000),
         "small chunks of the same message": MAGIC + START + IMU + chunk(message(1, SECOND, 0, b"") * 2000) * 100,
         "a chunk of the same channel": MAGIC + START + IMU + chunk(IMU * 1_000_000),
-        "large schemas": MAGIC + START + b"".join(chunk(schema(2 + k, "x", bytes(2**22))) for k in range(20)),
+        "large schemas": MAGIC + START + b"".join(chunk(schema(2 + k, "x", bytes(2**21))) for k in range(20)),
         "60000 schemas": MAGIC + START + b"".join(schema(2 + k) for k in range(60_000)),
         "30000 records of metadata": MAGIC + START + b"".join(metadata(f"m{k}", {}) for k in range(30_000)),
         "names of 40 kB": MAGIC + START + b"".join(channel(k, f"c/{'n' * 40_000}{k}/p") for k in range(1, 60)),
