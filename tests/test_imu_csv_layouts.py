@@ -93,6 +93,17 @@ def test_the_first_column_of_a_data_frame_has_no_title() -> None:
     np.testing.assert_allclose([reading.gyro for reading in found], GYRO, atol=1e-6)
 
 
+@pytest.mark.parametrize("separator", [",", "\t", " ", ";"])
+def test_a_serial_monitors_time_before_each_line_is_a_column(separator: str) -> None:
+    rows = [
+        f"18:08:{37 + t:06.3f} -> " + separator.join(f"{v:.6f}" for v in r) for t, r in zip(TIME, GYRO, strict=True)
+    ]
+    table = ImuTable(rows, columns={"time": "1", **told("gyro", "234")}, units={})
+    found = list(Joined([table]).readings())
+    assert [reading.stamp for reading in found] == EVERY_10_MS
+    np.testing.assert_allclose([reading.gyro for reading in found], GYRO, atol=1e-6)
+
+
 def test_capital_letters_count_only_where_titles_differ_in_nothing_else() -> None:
     columns = {"time": "t", **told("gyro", ["gx", "gy", "gz"])}
     table = ImuTable(lines("T,GX,GY,GZ", TIME.tolist(), GYRO), columns=columns, units={})

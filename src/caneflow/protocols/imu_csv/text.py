@@ -14,6 +14,7 @@ SPACES = " "  # one or more
 COMMENT_MARKS = ("#", "%", "//", "!")
 # Cells that say that there is no value; "nan" is a number to Python already.
 MISSING = {"", "-", "--", "null", "none", "na", "n/a", "#n/a", "<na>", "nil", "missing"}
+RECEIVED = re.compile(r"\s*(\d{1,2}:\d\d:\d\d[.,]\d+)\s*->\s*")  # when a serial monitor got the line
 GROUPED = re.compile(r"([+-]?)(\d{1,3}(?:\.\d{3})+(?=,)|\d{1,3}(?:,\d{3})+(?=\.))[.,](\d*)")  # 1.234,5 or 1,234.5
 LARGEST = 1e30  # no unit makes a measurement of more
 LARGEST_EXPONENT = 30  # of ten in a number for a time; beyond, no unit makes a stamp of it
@@ -62,6 +63,8 @@ def separator_of(lines: Sequence[str]) -> str:
 
 def cells_of(line: str, separator: str) -> list[str]:
     """The cells of one line: a stray quotation mark then costs its row, not all that follow."""
+    if "->" in line and (found := RECEIVED.match(line)):
+        line = found[1] + separator + line[found.end() :]
     if separator == SPACES:
         return line.split()
     try:
