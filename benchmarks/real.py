@@ -54,8 +54,6 @@ SOURCES = """\
 
 ## What the product cannot read
 
-* `a121-flow`: there is no importer for the vendor's h5.
-* The point clouds of `ti-handheld-loop`: no estimator takes a radar's point clouds.
 * `p4xx-walker-4nodes`: MATLAB files, no importer. `tests/test_room_trackers.py` follows the person by range alone,
   with a median distance below 0.15 m from the nominal triangle. No times are known of the triangle.
 """
@@ -75,6 +73,7 @@ MEASURES = (
     Measure("gait-loop-imu", real_figures.foot),
     Measure("broad-imu", real_figures.attitude),
     Measure("ti-handheld-loop", real_figures.handheld),
+    Measure("a121-flow", real_figures.water),
 )
 
 

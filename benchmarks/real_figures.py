@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
+from benchmarks.handheld_loop import recorded
 from caneflow.algorithms.radar.analytic_signal import AnalyticSignal
 from caneflow.algorithms.radar.background import Background
 from caneflow.algorithms.radar.range_doppler import bin_of_range, hann, range_doppler_map, speed_of_bin
 from caneflow.evaluation import run_flow
 from caneflow.messages import DopplerTarget, Imu, Pose, RadarFrame, numbered
-from caneflow.physics import GRAVITY
+from caneflow.physics import GRAVITY, SPEED_OF_LIGHT
 from caneflow.recording import Recording, RecordingWriter
 from caneflow.runtime.dataflow.loading import load
 
@@ -188,7 +189,15 @@ def handheld(source: Path, folder: Path) -> Sequence[Row]:
     world = rotated(np.array([sample.orientation or (np.nan,) * 4 for sample in found]), force)
     mean = world[walked].mean(axis=0)
     tilt = math.degrees(math.atan2(math.hypot(mean[0], mean[1]), mean[2]))
+    loop = walked(*recorded(source / "handheld_loop.npz"), seed=0)
     return (
+        Row(
+            "TI IWR6843 and IMU in the hand, loop of 23 m",
+            "begins and ends at one place",
+            "points to velocity, along the gyro's heading, summed: end to start, horizontal; path",
+            f"{loop.end_to_start:.2f} m; {loop.path:.1f} m",
+            "none for this loop",
+        ),
         Row(
             "IMU of a hand-held radar, walk of 23 m, 40 s",
             "no truth; a walk at even speed has no mean acceleration",
@@ -197,6 +206,33 @@ def handheld(source: Path, folder: Path) -> Sequence[Row]:
             "none",
         ),
     )
+
+
+def water(source: Path, folder: Path) -> Sequence[Row]:
+    """Water that flows away below an A121 at 45 degrees."""
+    found = []
+    for name in ("surface_velocity_1_dist", "surface_velocity_4_dist"):
+        out = folder / f"{name}.mcap"
+        caneflow("import", "a121", source / f"{name}.h5", "-o", out)
+        with Recording(out) as recording:
+            frames = [cast(RadarFrame, each.decoded()) for each in recording.samples([("radar", "frame")])]
+        found.append(np.mean([_mean_speed(frame) for frame in frames]))
+    return (
+        Row(
+            "A121 over flowing water, one and four ranges",
+            "not known; 1.5 to 1.6 m/s away by an independent script",
+            "mean radial speed of the frames (approaching is positive)",
+            ", ".join(f"{each:.2f}" for each in found) + " m/s",
+            "none",
+        ),
+    )
+
+
+def _mean_speed(frame: RadarFrame) -> float:
+    """Radial speed (m/s) of what moves in a frame, by the pulse pair over all its ranges."""
+    moving = frame.scans - frame.scans.mean(axis=0)
+    phase = float(np.angle((moving[1:] * moving[:-1].conj()).sum()))
+    return phase * SPEED_OF_LIGHT / (4.0 * math.pi * frame.carrier * frame.scan_period)
 
 
 def of_folder(mine: Path, folder: Path) -> Iterator[Row]:
