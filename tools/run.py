@@ -1,5 +1,6 @@
 """`caneflow run`: a dataflow as processes, live or on a recording."""
 
+import gc
 import math
 import sys
 import time
@@ -161,9 +162,13 @@ def _processes(*, detach: bool) -> "AsProcesses":
 def _run_here(graph: Graph, deployment: Deployment) -> Outcome:
     programs = {name: node.program for name, node in graph.nodes.items() if node.program is not None}
     host = InProcess(deployment, programs)
-    with Console(deployment.flow) as console:
-        progress = ReplayProgress(deployment.origin, deployment.last, console.played)
-        return host.run_until_interrupted(lambda stamp: progress.look((stamp,)))
+    gc.freeze()  # the operators and the graph stay until the end: not to be looked through again and again
+    try:
+        with Console(deployment.flow) as console:
+            progress = ReplayProgress(deployment.origin, deployment.last, console.played)
+            return host.run_until_interrupted(lambda stamp: progress.look((stamp,)))
+    finally:
+        gc.unfreeze()
 
 
 def _kept(

@@ -1,5 +1,6 @@
 """The door of the `caneflow` command: ready for Ctrl-C before anything that takes time to import is there."""
 
+import gc
 import os
 import sys
 from typing import NoReturn
@@ -17,6 +18,7 @@ def program() -> NoReturn:
     if COMPLETING not in os.environ:
         dispatch.restart_with_pinned_mathematics()
     interrupts.end_at_once()
+    gc.disable()  # until the word's tool is there: imports leave hardly any rubbish, and make much to look through
     main()
 
 

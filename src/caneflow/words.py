@@ -1,5 +1,6 @@
 """The words of the `caneflow` command: finds the tool for one, and turns an expected error into one line."""
 
+import gc
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -76,7 +77,11 @@ class Word(TyperCommand):
         if extra.get("resilient_parsing"):
             self._before = list(args)
             return super().make_context(info_name, [], parent, **extra)
-        context = _tool(self._module).make_context(info_name, args, parent, **extra)
+        tool = _tool(self._module)
+        if not gc.isenabled():
+            gc.freeze()  # what is imported stays, and need not be looked through again
+            gc.enable()
+        context = tool.make_context(info_name, args, parent, **extra)
         interrupts.begin_work()
         return context
 

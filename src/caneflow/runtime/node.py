@@ -3,6 +3,7 @@
 The launcher starts `python -m <program> <plan>`; the plan says what to read, what to write and whom to dial.
 """
 
+import gc
 import logging
 import signal
 import sys
@@ -72,6 +73,7 @@ def _run(programs: Mapping[str, Program], process: ProcessPlan, snapshots: Path)
             if len(built) > 1:
                 signal.signal(SOURCES_END, lambda *_: bus.put(SourcesEnd()))
             host = Process(process, bus, built, snapshots)
+        gc.freeze()  # what is there now stays until the end: at thousands of samples a second it shows
         with telling_failures(at=host.at):
             host.run()
 
