@@ -20,6 +20,7 @@ from caneflow.algorithms.quantities import Factor, Speed, Time
 
 _PRIOR: Final = (0.8, 0.2)  # a and b, in the open
 _PRIOR_WEIGHT: Final = 2 * 0.2**4  # (m/s)^4: of two values at 0.2 m/s
+_FASTEST: Final = 10.0  # m/s; a filter that says more has lost its way, and the coefficients must not
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +62,8 @@ class SidewaysSpread:
     def update(self, stamp_ns: int, spread: float, forward: float, left: float) -> Sideways | None:
         """Take a `spread` (m/s), with the antenna's velocity as the filter has it; None where it tells nothing."""
         settings = self._settings
+        if not math.hypot(forward, left) < _FASTEST:
+            return None
         if self._last_ns is not None:
             kept = math.exp(min(self._last_ns - stamp_ns, 0) * 1e-9 / settings.memory)
             self._ll, self._lf, self._ff = self._ll * kept, self._lf * kept, self._ff * kept

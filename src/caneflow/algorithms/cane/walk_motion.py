@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 
 _PX, _PY, _VX, _VY, _BX, _BY, _BZ, _TX, _TY, _BETA, _MX, _MY, _NX, _NY = range(14)
 STATES: Final = 14
+_ANYWHERE: Final = 3600.0  # s
 _IDENTITY: Final = np.eye(STATES)
 _MARKED: Final = [*range(_MX), _PX, _PY, _MX, _MY]  # states that become the states when the position is marked
 _MARKED_BOTH: Final = np.ix_(_MARKED, _MARKED)
@@ -156,13 +157,21 @@ class WalkMotion:
             self._p[velocity, position] += 0.5 * variance * t
 
     def coast(self, t: float) -> None:
-        """Go on by `t` s over which nothing was measured: the velocity holds, and is as unknown as at the start."""
+        """Go on by `t` s over which nothing was measured: the velocity holds, and is as unknown as at the start.
+
+        Longer than an hour is as long: the bearer is anywhere.
+        """
+        t = min(t, _ANYWHERE)
         self.predict(t, complex(self._x[_TX], self._x[_TY]), (0j, 0j, 0j))
         for axis in (_VX, _VY):
             self._p[axis, :] = self._p[:, axis] = 0.0
             self._p[axis, axis] = self._settings.velocity**2
         for axis in (_PX, _PY):
             self._p[axis, axis] += (self._settings.velocity * t) ** 2
+        if t > self._settings.tilt_time:  # nothing is left of what was known of it
+            for axis in (_TX, _TY):
+                self._p[axis, :] = self._p[:, axis] = 0.0
+                self._p[axis, axis] = self._settings.tilt**2
 
     def observe_velocity(
         self, along: tuple[float, float], value: float, variance: float, *, per_pointing: float = 0.0
@@ -201,6 +210,14 @@ class WalkMotion:
         """The way since the mark before the last one, m, x + jy."""
         x = self._x
         return complex(x[_PX] - x[_NX], x[_PY] - x[_NY])
+
+    @property
+    def way_covariance(self) -> Floats:
+        """Of that way, (2, 2) m^2."""
+        p = self._p
+        across: Floats = p[:2, _NX:]
+        covariance: Floats = p[:2, :2] + p[_NX:, _NX:] - across - across.T
+        return covariance
 
     def _correct(self, across: Floats, innovation: float, spread: float) -> float:
         """Kalman's correction; returns by how many standard deviations the innovation was off."""
