@@ -3,6 +3,7 @@
 in   imu   : Imu          orientation, linear acceleration, gyro, 100 Hz
 in   speed : GroundSpeed  one per radar frame, 100 Hz; shs, naive_ins and zero_velocity need none
 out  pose  : Pose         one per IMU sample
+out  local : Pose         likewise, if `with_local`, of `best`: in a frame that never leaps, for a local map
 
 `zero_velocity` is for an IMU on a foot: it takes raw gyro and accelerometer, and no orientation.
 """
@@ -11,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings
-from caneflow.algorithms.cane.dead_reckoning import DeadReckoning
+from caneflow.algorithms.cane.dead_reckoning import DeadReckoning, PoseEstimate
 from caneflow.algorithms.cane.kalman import KalmanFilter, KalmanSettings
 from caneflow.algorithms.cane.luenberger import LuenbergerObserver, LuenbergerSettings
 from caneflow.algorithms.cane.luenberger_fixed import FixedLuenbergerObserver, observer_constants
@@ -42,6 +43,7 @@ class FusionSettings:
     """Which estimator, and what each may be told."""
 
     method: Method = "luenberger"
+    with_local: bool = False  # fill the output local; method best alone
     luenberger: LuenbergerSettings = field(default_factory=LuenbergerSettings)  # also in fixed point
     kalman: KalmanSettings = field(default_factory=KalmanSettings)
     shs: StepHeadingSettings = field(default_factory=StepHeadingSettings)
@@ -52,6 +54,8 @@ class FusionSettings:
     glitches: CaneGlitchSettings = field(default_factory=CaneGlitchSettings)
 
     def __post_init__(self) -> None:
+        if self.with_local and self.method != "best":
+            raise ValueError(f"with_local is for the method best; {self.method} has one pose")
         if self.method == "luenberger_fixed":  # raises for what fixed point does not have
             observer_constants(self.luenberger, (0.0, 1.0, 0.0))
 
@@ -60,7 +64,8 @@ class Fusion(Operator):
     """One estimator, told of every speed and asked at every IMU sample."""
 
     inputs = {"imu": Imu, "speed": GroundSpeed}
-    outputs = {"pose": Pose}
+    outputs = {"pose": Pose, "local": Pose}
+    optional_outputs = frozenset({"local"})  # with_local
     optional_inputs = frozenset({"speed"})  # of a graph without radar, for methods that need none
     Settings = FusionSettings
 
@@ -86,7 +91,10 @@ class Fusion(Operator):
     def handle(self, port: str, message: Sample) -> Emitted:
         """The pose at an IMU sample's stamp; a speed only informs the estimator."""
         if isinstance(message, Imu):
-            return (("pose", self._pose(message)),)
+            pose = self._pose(message)
+            if self._settings.with_local and isinstance(self._estimator, CaneFilter):
+                return ("pose", pose), ("local", _pose(pose.stamp, self._estimator.local(), pose.method, pose.status))
+            return (("pose", pose),)
         if isinstance(message, GroundSpeed):
             self._take_speed(message)
         return ()
@@ -126,15 +134,8 @@ class Fusion(Operator):
         estimate = self._estimator.imu(imu.stamp, reading)
         held = self._estimator.held if self._estimator.has_gates else self._gate.held + self._held
         self._held = ()
-        return Pose(
-            stamp=imu.stamp,
-            position=estimate.position,
-            velocity=estimate.velocity,
-            orientation=estimate.orientation,
-            covariance=estimate.covariance,
-            method=self._method,
-            status=" ".join([f"held:{what}" for what in held]) if held else None,
-        )
+        status = " ".join([f"held:{what}" for what in held]) if held else None
+        return _pose(imu.stamp, estimate, self._method, status)
 
     def _require(self, stamp_ns: int, reading: ImuReading) -> None:
         """Raise ValueError for a sample that the method cannot use, before it has changed anything."""
@@ -153,6 +154,18 @@ class Fusion(Operator):
             self._start()
         else:
             self._samples += 1
+
+
+def _pose(stamp_ns: int, estimate: PoseEstimate, method: str, status: str | None) -> Pose:
+    return Pose(
+        stamp=stamp_ns,
+        position=estimate.position,
+        velocity=estimate.velocity,
+        orientation=estimate.orientation,
+        covariance=estimate.covariance,
+        method=method,
+        status=status,
+    )
 
 
 def estimator(settings: FusionSettings, rig: Rig) -> DeadReckoning:

@@ -1,6 +1,7 @@
 """`best` on made-up walks: conventions, delays, rest, gaps, loss of inputs, and whether its covariance is honest."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -64,6 +65,7 @@ def run(
     mag: bool = True,
     speed_first: bool = False,
     dropped: slice = slice(0, 0),
+    watch: Callable[[CaneFilter], None] = lambda cane: None,
 ) -> tuple[CaneFilter, list[PoseEstimate]]:
     """The filter's estimates; radar values belong `delay` samples before their stamps; samples `dropped` are lost."""
     cane = CaneFilter(settings or CaneFilterSettings(), boresight=BORESIGHT, pivot=PIVOT)
@@ -99,6 +101,7 @@ def run(
             radar()
         field = rotate(inverse, (-20.0 * math.sin(north), 20.0 * math.cos(north), -40.0)) if mag else None
         estimates.append(cane.imu(stamp_ns, ImuReading(gyro, accel, field, orientation=body)))
+        watch(cane)
         if not speed_first:
             radar()
     return cane, estimates
@@ -353,3 +356,34 @@ def test_a_radar_that_moves_sideways_is_believed_less() -> None:
         variances.append(1.0 / (1.0 / variance - 1.0))
     assert variances[0] == pytest.approx(0.08, rel=0.05)
     assert variances[1] == pytest.approx(0.08 + (0.14 * 2.0 * math.cos(PITCH)) ** 2, rel=0.05)
+
+
+def test_the_local_pose_never_leaps_and_its_covariance_grows_as_the_way_does() -> None:
+    """When the field shows the gyro's bias, the track is laid anew; a map of the last seconds must not notice."""
+    walk = loop(gyro_bias=0.3 * DEGREE, noise=0.05, alike=9 / 11)
+    locals_: list[PoseEstimate] = []
+    _, estimates = run(walk, watch=lambda cane: locals_.append(cane.local()))
+
+    def largest_leap(poses: list[PoseEstimate]) -> float:
+        places = np.array([pose.position[:2] for pose in poses])
+        speeds = np.array([pose.velocity[:2] for pose in poses])
+        return float(np.linalg.norm(np.diff(places, axis=0) - 0.01 * speeds[1:], axis=1).max())
+
+    assert largest_leap(locals_) < 0.006  # what the radar corrects in 10 ms, spread over 0.3 s
+    assert largest_leap(estimates) > 0.02
+    # the way of the last seconds, in the heading at its start, is as far off as the covariance has grown
+    squares, grown = [], []
+    for start in range(400, len(locals_) - 500, 100):
+        first, last = locals_[start], locals_[start + 500]
+        assert first.covariance is not None
+        assert last.covariance is not None
+        ahead = rotate(first.orientation, BORESIGHT)
+        off = math.atan2(ahead[1], ahead[0]) - walk.yaws[start]
+        way = np.array(last.position[:2]) - np.array(first.position[:2])
+        turn = np.array([[math.cos(off), -math.sin(off)], [math.sin(off), math.cos(off)]])
+        error = way - turn @ (walk.truth[start + 500] - walk.truth[start])
+        growth = last.covariance[:2, :2] - first.covariance[:2, :2]
+        assert np.linalg.eigvalsh(growth).min() > 0.0
+        squares.append(float(error @ error))
+        grown.append(float(np.trace(growth)))
+    assert 0.5 < math.sqrt(np.mean(squares) / np.mean(grown)) < 1.8

@@ -239,7 +239,7 @@ def test_the_canes_own_graph_is_sound() -> None:
         "fusion.imu": "imu/imu",
         "fusion.speed": "ground_speed/speed",
     }
-    assert graph.nodes["fusion"].outputs == {"pose": Pose}
+    assert graph.nodes["fusion"].outputs == {"pose": Pose, "local": Pose}
     assert graph.rig["boresight"] == [0, 1, 0]
 
 

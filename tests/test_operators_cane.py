@@ -305,3 +305,23 @@ def test_what_needs_no_speed_runs_where_none_is_wired_and_the_rest_says_so() -> 
     for method in needing:
         with pytest.raises(MessageError, match=f"method {method} needs the input speed, which is not wired"):
             Fusion(FusionSettings(method=method), alone)
+
+
+def test_the_local_pose_is_sent_where_it_is_asked_for() -> None:
+    """At the start the two are one; afterwards both are of each sample."""
+    rig = Rig(pivot=(0.0, -0.3, 0.0))
+    with_local = Fusion(FusionSettings(method="best", with_local=True), context(rig))
+    alone = Fusion(FusionSettings(method="best"), context(rig))
+    for port, message in samples():
+        if port == "imu":
+            (first, pose), (second, local) = with_local.handle(port, message)
+            assert (first, second) == ("pose", "local")
+            ((_, same),) = alone.handle(port, message)
+            assert isinstance(pose, Pose)
+            assert isinstance(local, Pose)
+            assert isinstance(same, Pose)
+            assert local.stamp == pose.stamp == message.stamp
+            assert pose.position == same.position
+            assert local.position == pytest.approx(pose.position, abs=0.05)
+    with pytest.raises(ValueError, match="with_local is for the method best; luenberger has one pose"):
+        FusionSettings(with_local=True)

@@ -84,6 +84,7 @@ class Operator(ABC):
     inputs: ClassVar[Mapping[str, type[Sample]]] = {}
     outputs: ClassVar[Mapping[str, type[Sample]]] = {}
     optional_inputs: ClassVar[frozenset[str]] = frozenset()  # ports that a graph may leave open
+    optional_outputs: ClassVar[frozenset[str]] = frozenset()  # ports that nobody needs to read
     Settings: ClassVar[type[Any]] = NoSettings  # a frozen dataclass or pydantic model
 
     @abstractmethod

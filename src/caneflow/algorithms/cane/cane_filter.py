@@ -120,6 +120,7 @@ _LONGEST_SPREAD: Final = 0.6  # s by which it may lag: as far as the history rea
 _VERTICAL: Final = 1e-6  # horizontal part of a unit vector, below which it has no direction
 _UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
 _POINTING_TIME: Final = 0.2  # s
+_SHORTEST_GROWTH: Final = 0.5  # s
 
 
 class CaneFilter(DeadReckoning):
@@ -166,6 +167,12 @@ class CaneFilter(DeadReckoning):
         self._radar_speed = 0.0  # m/s, the last
         self._since_heading = self._since_sideways = 0.0  # s
         self._correction = 0j  # m in the gyro's frame, by which the track has yet to move
+        self._local = 0j  # m, the track that never leaps
+        self._local_covariance: Floats = np.zeros((2, 2))  # m^2, of it at the last mark; grows as the way's does
+        self._local_growth: Floats = np.zeros((2, 2))  # m^2/s, since then
+        self._since_mark = 0.0  # s
+        self._local_yaw = 0.0  # rad, its frame's to be added to the gyro's
+        self._chip: Quaternion = (1.0, 0.0, 0.0, 0.0)  # orientation of the last sample
 
     @property
     def gaps(self) -> int:
@@ -260,6 +267,7 @@ class CaneFilter(DeadReckoning):
         self._correction -= shown
 
         self.heading.move(elapsed, turned, moved.real + shown.real, moved.imag + shown.imag)
+        self._follow_local(elapsed, turned, moved + shown, orientation)
         if self._turns.variance > 0.0:
             self._turns.move(moved + shown)
         self._see_field(orientation, reading.mag)
@@ -267,6 +275,47 @@ class CaneFilter(DeadReckoning):
         if self._since_heading >= self._settings.heading_interval:
             self._follow_heading()
         return self._estimate(orientation)
+
+    def local(self) -> PoseEstimate:
+        """The pose as of the last sample in a frame that is never laid anew: for a map of the last seconds.
+
+        What is learnt of the gyro turns what comes, and not what was. The frame drifts away from R0 as the gyro does.
+        The growth of the position's covariance between two poses is that of the way between them, over 1 to 5 s, in
+        the heading of the first; the velocity's is that of the velocity, and what they share is not told.
+        """
+        turn = cmath.rect(1.0, self._local_yaw)
+        velocity = turn * complex(*self._motion.velocity)
+        covariance = np.zeros((6, 6))
+        covariance[:2, :2] = self._local_covariance + self._since_mark * self._local_growth
+        covariance[3:5, 3:5] = _turned(self._motion.covariance[2:4, 2:4], turn)
+        covariance[2, 2], covariance[5, 5] = self._heave.height_variance, self._heave.rate_variance
+        return PoseEstimate(
+            position=(self._local.real, self._local.imag, self._heave.height - (self._start_height or 0.0)),
+            velocity=(velocity.real, velocity.imag, self._heave.rate),
+            orientation=multiply(from_yaw(self._yaw.offset + self._local_yaw), self._chip),
+            covariance=covariance,
+        )
+
+    def _follow_local(self, elapsed: float, turned: float, moved: complex, orientation: Quaternion) -> None:
+        """Go on by what the cane `turned` (rad) and `moved` (m) in the gyro's frame."""
+        bias, scale = self.heading.drift
+        self._local_yaw -= bias * elapsed + scale * turned
+        self._local += cmath.rect(1.0, self._local_yaw) * moved
+        self._since_mark += elapsed
+        self._chip = orientation
+
+    def _grow_local(self, elapsed: float | None) -> None:
+        """From now on the local covariance grows as that of the way in the last `elapsed` s did.
+
+        Where nobody knows, as if the velocity were wrong by its own sd for a second.
+        """
+        self._local_covariance = self._local_covariance + self._since_mark * self._local_growth
+        self._since_mark = 0.0
+        if elapsed is None:
+            growth = self._motion.covariance[2:4, 2:4]
+        else:
+            growth = self._motion.way_covariance / max(elapsed, _SHORTEST_GROWTH)
+        self._local_growth = _turned(growth, cmath.rect(1.0, self._local_yaw))
 
     def _lift(self, elapsed: float, interval: float, acceleration: float, orientation: Quaternion) -> None:
         """Up and down; the hand's height is the zero, because only changes of height are given out."""
@@ -293,6 +342,7 @@ class CaneFilter(DeadReckoning):
         else:
             self._motion.coast(elapsed)
             self._swing.forget()
+            self._grow_local(None)
         self._gained += gained
         variance = (s.hole_turn * elapsed) ** 2
         self.heading.doubt(variance)
@@ -410,6 +460,7 @@ class CaneFilter(DeadReckoning):
             variance = settings.way_error**2 + (settings.way_share * abs(way)) ** 2
             variance += (settings.way_per_turn * since.turned) ** 2
             motion.observe_way((left.real, left.imag), value, variance, per_pointing=-along)
+        self._grow_local(None if since is None else since.elapsed)
         motion.mark()
 
     def _see_field(self, orientation: Quaternion, mag: Vector | None) -> None:
@@ -525,6 +576,13 @@ def level_covariance(motion: Floats, heading: Heading, turn: complex, velocity: 
     covariance[3, 4] = covariance[4, 3] = -yaw * velocity.real * velocity.imag
     covariance += turned @ motion @ turned.T
     return covariance
+
+
+def _turned(covariance: Floats, turn: complex) -> Floats:
+    """A covariance (2, 2) turned by `turn`."""
+    rotation = np.array(((turn.real, -turn.imag), (turn.imag, turn.real)))
+    found: Floats = rotation @ covariance @ rotation.T
+    return found
 
 
 def _level_axes(turn: complex, orientation: Quaternion) -> Axes:

@@ -95,7 +95,13 @@ class HeadingHypotheses:
         self._spread_share = np.full(len(self._spreads), 1.0 / len(self._spreads))
         grid = np.sinh(np.linspace(-2.0, 2.0, settings.biases)) / math.sinh(2.0)
         self._summary = Heading(0j, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._drift = 0.0, 0.0  # rad/s, 1
         self._start(settings.largest_bias * grid)
+
+    @property
+    def drift(self) -> tuple[float, float]:
+        """Bias (rad/s) and scale error of the gyro about the vertical, as of the last `advance`."""
+        return self._drift
 
     @property
     def bias(self) -> float:
@@ -159,6 +165,8 @@ class HeadingHypotheses:
 
     def _summarise(self) -> None:
         self._summary = self._mean(self._yaws(self._elapsed, self._turned), self._tracks)
+        weights, total = self._weights, np.add.reduce
+        self._drift = float(total(weights * self._biases)), float(total(weights * self._scales))
 
     def _mean(self, yaws: Floats, tracks: Complexes) -> Heading:
         weights, total = self._weights, np.add.reduce

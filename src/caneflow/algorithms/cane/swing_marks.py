@@ -14,6 +14,7 @@ _LONGEST_SWING: Final = 1.5  # s of half a swing
 class FullSwing(NamedTuple):
     """What happened since the mark before the last one."""
 
+    elapsed: float  # s
     yaw: float  # rad, mean of the boresight's
     turned: float  # rad, the boresight from then to now
     arm: complex  # m, change of the arm from IMU to hand
@@ -59,8 +60,9 @@ class SwingMarks:
         new, since = _Mark(self._elapsed, self._sum, self._turn, arm), None
         if len(self._marks) == 2:
             older, last = self._marks
-            mean = (last.sum + new.sum) / (last.elapsed + new.elapsed)
-            since = FullSwing(yaw + mean - self._turn, self._turn - older.turn, arm - older.arm)
+            elapsed = last.elapsed + new.elapsed
+            mean = (last.sum + new.sum) / elapsed
+            since = FullSwing(elapsed, yaw + mean - self._turn, self._turn - older.turn, arm - older.arm)
         self._marks.append(new)
         self._elapsed = self._sum = 0.0
         return since

@@ -56,14 +56,21 @@ def warn_of_unread(document: Document, flow: FlowShape, parts: Mapping[str, Part
     """Note the outputs that nobody reads: work for nothing, or a wire that was forgotten."""
     read = {wire.stream for part in parts.values() for wire in part.wires.values()} | set(flow.results)
     for name, part in parts.items():
+        spare = _spare_outputs(part)
         for port, kind in (part.outputs or {}).items():
-            if f"{name}/{port}" not in read and port != ANY_PORT:
+            if f"{name}/{port}" not in read and port != ANY_PORT and port not in spare:
                 document.problem(
                     ("nodes", name),
                     f"no node reads its output {name}/{port} ({_named(kind)}); wire it, or list it under results",
                     key=True,
                     warning=True,
                 )
+
+
+def _spare_outputs(part: Part) -> frozenset[str]:
+    """Ports that nobody needs to read."""
+    program = part.program
+    return program.optional_outputs if program is not None and issubclass(program, Operator) else frozenset()
 
 
 def _carried(
