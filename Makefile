@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 # The environment is made once, and again when the project's needs change. A dot every two seconds says that it goes on.
 define install
-	@$(BIN)/pip install --quiet --disable-pip-version-check $(LOCK) --editable $(1) & installing=$$!; \
+	@$(BIN)/pip install --quiet --disable-pip-version-check $(LOCK) --editable $(1) & installing=$$!; trap 'kill $$installing; exit 130' INT TERM; \
 	while kill -0 $$installing 2>/dev/null; do printf .; sleep 2; done; echo; wait $$installing
 	@touch $@
 endef
@@ -24,7 +24,7 @@ endef
 $(BIN)/.runs: pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@echo "installing what caneflow runs on: numpy, scipy, Zenoh, matplotlib ... (about a minute)"
-	$(call install,'.[plot]')
+	$(call install,'.[plot,view]')
 
 # And what tests, linters and pages need.
 $(BIN)/.installed: $(BIN)/.runs pyproject.toml
@@ -39,7 +39,7 @@ run: $(BIN)/.runs $(WALK)
 	$(BIN)/caneflow run dataflows/compare.yaml --replay $(WALK) --speed max --record build/track.mcap --overwrite
 	$(BIN)/caneflow plot build/track.mcap --output build/track.png
 	@echo
-	@echo "six processes found the way of a simulated walk by two methods: best, and the paper's (1.3 m in the mean)"
+	@echo "six processes found the way of a simulated walk by two methods: best, and the paper's"
 	@echo "build/track.png shows both tracks over the true one, their errors, the speed and the radar's Doppler"
 	@echo "next: . $(BIN)/activate && caneflow run dataflow.yaml --replay $(WALK)    (or: caneflow --help)"
 

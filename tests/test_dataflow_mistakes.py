@@ -363,7 +363,7 @@ def test_one_mistake_is_one_line(folder: Path, name: str) -> None:
             "fuse.observer.pol=1",
             "--set fuse.observer.pol=1: nodes.fuse.settings.observer.pol: unknown key; did you ",
         ),
-        ("fuse.count=[1", "--set fuse.count=[1: is no YAML: expected ',' or ']', but got '<stream end>'"),
+        ("fuse.count=[1", "--set fuse.count=[1: not YAML: expected ',' or ']', but got '<stream end>'"),
         ("fuse.count=", "--set fuse.count=: nodes.fuse.settings.count: is null; it takes a whole number"),
     ],
 )

@@ -245,7 +245,7 @@ def test_files_without_chunks_are_read(tmp_path: Path) -> None:
     [
         (None, "cannot be read: No such file"),
         (b"", "is empty"),
-        (b"time,x,y\n", "is no MCAP file, it starts with b'time,x,y'"),
+        (b"time,x,y\n", "is not an MCAP file, it begins with b'time,x,y'"),
         (b"\x89MCAP", "was cut in its first bytes"),
         (b"\x89MCAP0\r\n", "has no metadata record 'caneflow' with 'flow', it was cut before there was any"),
     ],

@@ -202,5 +202,5 @@ def test_the_command_itself_says_the_same(file: Path) -> None:
     done = subprocess.run([caneflow, "check", file], capture_output=True, text=True, check=False)
 
     assert done.returncode == 1
-    assert done.stdout == f"{file}:2:1: is no YAML: expected ',' or ']', but got '<stream end>'\n"
+    assert done.stdout == f"{file}:2:1: not YAML: expected ',' or ']', but got '<stream end>'\n"
     assert done.stderr == ""

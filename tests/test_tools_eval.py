@@ -174,7 +174,7 @@ def test_a_bad_recording_does_not_stop_the_others(walks: list[Path], tmp_path: P
     assert list(json.loads(done.stdout)["luenberger"]) == [str(walks[0])]
     said = done.stderr.splitlines()
     assert len(said) == 2
-    assert f"{bad}: is no MCAP file" in said[0]
+    assert f"{bad}: is not an MCAP file" in said[0]
     assert f"{missing}: cannot be read" in said[1]
 
 

@@ -72,6 +72,13 @@ def test_a_word_of_python_is_no_name_for_a_file(caneflow: Callable[..., Run], tm
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["json", "struct", "numpy", "pytest"])
+def test_a_file_hides_no_installed_module(caneflow: Callable[..., Run], tmp_path: Path, name: str) -> None:
+    said = f"caneflow new: {name!r} is the name of an installed module, which a file of this name would hide\n"
+    assert caneflow("new", "operator", name, "--folder", tmp_path) == (2, "", said)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", ["Smooth", "9x", "a-b", "../x", "a.b"])
 def test_a_name_that_is_no_nodes_is_refused(caneflow: Callable[..., Run], tmp_path: Path, name: str) -> None:
     status, out, err = caneflow("new", "driver", name, "--folder", tmp_path)

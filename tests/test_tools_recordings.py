@@ -110,7 +110,7 @@ def test_a_file_that_is_no_recording_is_one_line(caneflow: Callable[..., Run], t
     name, *options = word.split()
     status, out, err = caneflow(name, path, *options)
     assert (status, out) == (2, "")
-    assert err.startswith(f"caneflow {name}: {path}: is no MCAP file")
+    assert err.startswith(f"caneflow {name}: {path}: is not an MCAP file")
     assert err.count("\n") == 1
 
 

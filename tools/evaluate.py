@@ -188,7 +188,7 @@ def lines(by_method: By) -> Iterator[str]:
     walks = max(sum(figures["nees"] is not None for figures in each.values()) for each in by_method.values())
     if walks:
         low, high = consistent_mean(walks)
-        yield f"Over {walks} walks its mean lies within {low:.2f} .. {high:.2f} in 95 % of all cases then."
+        yield f"Over {walks} walk{'s' * (walks > 1)} its mean lies within {low:.2f} .. {high:.2f} in 95 % of all cases."
 
 
 def _walks(by_method: By) -> Iterator[Sequence[str]]:

@@ -1,6 +1,7 @@
 """`caneflow new`: a program or a message of your own that works, with its test and the line that uses it."""
 
 import sys
+from importlib.util import find_spec
 from keyword import iskeyword
 from pathlib import Path
 from typing import Annotated
@@ -290,14 +291,20 @@ def flow(
     file = output or Path(f"{name}.yaml")
     with whole(file, overwrite=overwrite) as fresh:
         assert fresh is not None, "an output is named"
-        fresh.write_text(text, encoding="utf-8")
+        fresh.write_text(text.replace("caneflow check dataflow.yaml", f"caneflow check {file.name}"), encoding="utf-8")
     print(f"{file}: written")
     if name == "cane":
-        print("caneflow simulate walk -o walk.mcap")  # 53 s, made in a moment
-        print(f"caneflow run {file} --replay walk.mcap --record track.mcap")
+        print("caneflow simulate walk -o walk.mcap")  # 54 s of a walk, made in about 20
+        print(f"caneflow run {file} --replay walk.mcap --speed max --record track.mcap")
 
 
 commands = {"operator": operator, "driver": driver, "message": message, "flow": flow}
+
+
+def _is_installed(name: str) -> bool:
+    """Whether a package, of pip or of Debian, has this name."""
+    spec = find_spec(name)
+    return spec is not None and spec.origin is not None and "-packages" in spec.origin
 
 
 def _write(name: str, folder: Path, program: str, test: str, line: str, *, overwrite: bool) -> None:
@@ -312,6 +319,8 @@ def _write_files(name: str, folder: Path, program: str, test: str, *, overwrite:
         raise CaneflowError(f"{name!r} is not a valid name: expected {NAME_RULE}")
     if iskeyword(name):
         raise CaneflowError(f"{name!r} is a word of Python's own; a file of this name cannot be imported")
+    if name in sys.stdlib_module_names or _is_installed(name):
+        raise CaneflowError(f"{name!r} is the name of an installed module, which a file of this name would hide")
     files = {folder / f"{name}.py": program, folder / f"test_{name}.py": test}
     for path in files:
         require_free(path, overwrite=overwrite)

@@ -54,7 +54,7 @@ WORDS: dict[str, tuple[str, str]] = {
     "bench": ("bench", "Measure how fast a recording runs, and where the time goes."),
     "calibrate": ("calibrate", "Fit the rig to recordings."),
     "plot": ("plot", "Draw a recording's track and speed."),
-    "view": ("view", "Show a running flow in the browser."),
+    "view": ("view", "Show a running flow, or a recording, in the browser."),
     "ros2": ("ros2", "Show a running flow to ROS 2, without ROS."),
     "foxglove": ("foxglove", "Show a running flow, or a recording, to Foxglove."),
     "schema": ("schema", "Print the JSON Schema of a message or of a dataflow file."),

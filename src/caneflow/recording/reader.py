@@ -440,7 +440,9 @@ def require_mcap(path: Path, file: BinaryIO) -> None:
         raise RecordingError(f"{path}: is empty; {EXPECTED}")
     if start != MAGIC:
         found = (
-            "was cut in its first bytes" if MAGIC.startswith(start) else f"is no MCAP file, it starts with {start!r}"
+            "was cut in its first bytes"
+            if MAGIC.startswith(start)
+            else f"is not an MCAP file, it begins with {start!r}"
         )
         raise RecordingError(f"{path}: {found}; {EXPECTED}")
 

@@ -18,6 +18,7 @@ from ruamel.yaml.reader import ReaderError
 from caneflow.runtime.errors import DataflowError, Place, Problem
 from caneflow.runtime.wording import KeyPath, dotted, one_line, shown
 
+MCAP = b"\x89MCAP"  # how a recording begins
 MAX_BYTES = 2**20  # a graph of hundreds of nodes has 100 kB
 MAX_DEPTH = 32  # mappings and lists inside each other
 MAX_VALUES = 50_000  # aliases of aliases may stand for more values than fit into memory
@@ -90,6 +91,9 @@ def read_yaml(path: Path) -> Document:
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
         reason = getattr(error, "strerror", None) or error
         raise _broken(Place(source=source), f"cannot be read: {reason}") from error
+    if data.startswith(MCAP):
+        example = f"caneflow run dataflow.yaml --replay {source}"
+        raise _broken(Place(source=source), f"a recording, not a dataflow; expected e.g. {example}")
     if len(data) > MAX_BYTES:
         raise _broken(Place(source=source), f"larger than {MAX_BYTES} bytes, the limit for a dataflow file")
     try:
@@ -97,7 +101,7 @@ def read_yaml(path: Path) -> Document:
     except UnicodeDecodeError as error:
         start = error.start
         place = Place(source=source, line=data.count(b"\n", 0, start) + 1, column=_column(data, start))
-        raise _broken(place, f"byte 0x{data[start]:02x} is no UTF-8; save the file as UTF-8 text") from error
+        raise _broken(place, f"byte 0x{data[start]:02x} not UTF-8; save the file as UTF-8 text") from error
     return compose(text, source)
 
 
@@ -115,17 +119,17 @@ def compose(text: str, source: str) -> Document:
         mark = error.problem_mark or error.context_mark
         place = Place(source=source, line=mark.line + 1, column=mark.column + 1)
         said = error.problem if error.problem is not None else error.context
-        raise _broken(place, f"is no YAML: {one_line(said)}{_advice(one_line(said))}") from error
+        raise _broken(place, f"not YAML: {one_line(said)}{_advice(one_line(said))}") from error
     except ReaderError as error:
         place = Place(source=source, line=text.count("\n", 0, error.position) + 1, column=_column(text, error.position))
-        raise _broken(place, f"is no YAML: character {ord(text[error.position]):#06x} is not allowed") from error
+        raise _broken(place, f"not YAML: character {ord(text[error.position]):#06x} is not allowed") from error
     except RecursionError as error:
         raise _broken(Place(source=source, line=1, column=1), f"is nested more than {MAX_DEPTH} deep") from error
     except _TooMuch as error:
         raise _broken(Place(source=source, line=1, column=1), str(error)) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, AssertionError) as error:
         # ruamel's scanner has its own slips on texts that are no YAML (an AttributeError after a bad directive).
-        raise _broken(Place(source=source, line=1, column=1), f"is no YAML: {one_line(error)}") from error
+        raise _broken(Place(source=source, line=1, column=1), f"not YAML: {one_line(error)}") from error
     return document
 
 
@@ -260,6 +264,8 @@ def _advice(said: str) -> str:
         return "; indent with spaces, not with tabs"
     if "expected a single document" in said or "another document" in said:
         return "; one file is one dataflow"
+    if "expected <block end>" in said:
+        return "; check the indentation of this line"
     return ""
 
 

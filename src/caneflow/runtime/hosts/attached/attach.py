@@ -228,8 +228,9 @@ def launchers_of(flow: str | None) -> list[RunningFlow]:
         return fitting
     if not running:
         refused = "".join(f"; {said}" for said in refused_addresses())
+        named = "" if flow is None else f" {flow!r}, nor any other,"
         raise DataflowError(
-            f"no flow runs on this machine; start one with `caneflow run FILE`, or name another's: --at{refused}"
+            f"no flow{named} runs on this machine; start one with `caneflow run FILE`, or name another's: --at{refused}"
         )
     names = sorted({found.flow for found in (fitting or running)})
     if not fitting:

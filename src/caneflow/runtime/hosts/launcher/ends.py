@@ -55,7 +55,7 @@ class Ends:
             return
         if not isinstance(verdict, Again):
             node.state = "failed"
-            tried = f" after {node.restarts} restarts" if node.restarts else ""
+            tried = f" after {node.restarts} restart{'s' * (node.restarts > 1)}" if node.restarts else ""
             why = verdict.why or (node.records and RECORDS) or ""
             parts = (f"{name} {cause}{tried}", why, node.last_line)
             self._outcome.failures.append(": ".join(filter(None, parts)))

@@ -60,8 +60,8 @@ def telling_failures(*, building: bool = False, at: Callable[[], str | None] | N
 
 def words_of(error: BaseException, *, building: bool, at: str | None) -> LastWords:
     """What there is to say of an exception."""
-    lasting = isinstance(error, ImportError) or (
-        building and isinstance(error, Exception) and not _by_the_system(error)
+    lasting = _stems_from(error, ImportError) or (
+        building and isinstance(error, Exception) and not _stems_from(error, OSError)
     )
     if isinstance(error, CaneflowError):
         return LastWords(error=f"ERROR {one_line(str(error))}", place=str(error), at=at, lasting=lasting)
@@ -84,11 +84,15 @@ def heard(line: str) -> LastWords | None:
         return None
 
 
-def _by_the_system(error: BaseException) -> bool:
-    """Whether the operating system refused something: a device or a disk may be there the next time."""
+def _stems_from(error: BaseException, kind: type[BaseException]) -> bool:
+    """Whether an error, or what caused it, is of a kind.
+
+    ImportError: a package is missing, and will be the next time. OSError: the operating system refused something; a
+    device or a disk may be there the next time.
+    """
     cause: BaseException | None = error
     for _ in range(DEPTH):
-        if isinstance(cause, OSError):
+        if isinstance(cause, kind):
             return True
         cause = cause.__cause__ if cause is not None else None
     return False
