@@ -20,11 +20,12 @@ define install
 	@touch $@
 endef
 
-# What it runs on: enough for `make run`.
+# What it runs on: enough for `make run` and the page.
+RUNS_ON := .[plot,view]
 $(BIN)/.runs: pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@echo "installing what caneflow runs on: numpy, scipy, Zenoh, matplotlib ... (about a minute)"
-	$(call install,'.[plot,view]')
+	$(call install,'$(RUNS_ON)')
 
 # And what tests, linters and pages need.
 $(BIN)/.installed: $(BIN)/.runs pyproject.toml
