@@ -400,7 +400,7 @@ def test_keys_are_built_and_taken_apart() -> None:
     assert sample_key("cane", "imu", "imu") == "cane/imu/imu"
     assert control_key("cane", "progress", "imu") == "cane/@/progress/imu"
     assert stream_of("elsewhere/radar/frame") == ("radar", "frame")
-    with pytest.raises(ValueError, match="no sample's key"):
+    with pytest.raises(ValueError, match="not a sample's key"):
         stream_of("cane/@/start")
 
 

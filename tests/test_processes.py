@@ -383,7 +383,7 @@ def test_a_node_that_fails_for_good_ends_the_run(live: Path, tmp_path: Path) -> 
     assert done.returncode == 1
     assert done.stderr.count("Traceback") == 1
     last = done.stderr.splitlines()[-1]
-    assert re.fullmatch(r"caneflow run: echo ended with status 1 after 1 restarts: .*: RuntimeError: no more", last)
+    assert re.fullmatch(r"caneflow run: echo ended with status 1 after 1 restart: .*: RuntimeError: no more", last)
 
 
 @pytest.mark.parametrize(
@@ -407,7 +407,7 @@ def test_in_a_replay_the_second_fault_at_one_sample_ends_the_run(
     assert "restart 2" not in done.stderr
     why = r"given up, it was the second time at the same sample \(imu seq 250\)"
     last = done.stderr.splitlines()[-1]
-    assert re.fullmatch(rf"caneflow run: echo ended with status \d after 1 restarts: {why}: {error}", last)
+    assert re.fullmatch(rf"caneflow run: echo ended with status \d after 1 restart: {why}: {error}", last)
 
 
 @pytest.mark.parametrize(

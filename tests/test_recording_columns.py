@@ -104,7 +104,7 @@ def test_a_frame_is_that_of_a_library_that_is_there_or_the_line_that_installs_on
     path = recorded(tmp_path / "a.mcap", [Imu(stamp=7, gyro=(1.0, 2.0, 3.0))])
     with Recording(path) as recording:
         monkeypatch.setattr("caneflow.recording.reader.find_spec", lambda name: None)
-        with pytest.raises(RecordingError, match="pip install polars"):
+        with pytest.raises(RecordingError, match=r"pip install 'caneflow\[parquet\]'"):
             recording.frame("a/b")
         monkeypatch.setattr("caneflow.recording.reader.find_spec", lambda name: name == "pandas" or None)
         monkeypatch.setattr("caneflow.recording.reader.import_module", lambda name: Frames)
