@@ -7,8 +7,10 @@ for it is seen to be there, and no part of it in the band is taken for the whole
 
 A window in which the channel, or one of I and Q, stands still for a whole period of the lowest frequency is silent:
 it has no spectrum, and the floor learns nothing from it. Single impulses and steps are taken out before the transform.
+A block that is lost, or that is far louder than all around it, is bridged.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
@@ -35,7 +37,11 @@ LEAK = 10.0**-1.8
 LEAK_FROM = 2.4  # cells, 1 / window
 MOST_ROWS = 1000  # of the floor's memory
 LARGEST_WINDOW = 1 << 20  # samples: 5 s of a sound card's 192 kHz
-FORGOTTEN = 1.0  # s without a block, after which one of another make is believed at once
+FORGOTTEN = 1.0  # s without a block, after which one of another make, or of another level, is believed at once
+BRIDGED = 0.25  # of the window: the longest gap across which it goes on; a line loses at most 4 dB of its SNR by it
+# dB over the block before: nobody comes so fast; what stays there for three blocks is believed
+WILD = 40.0
+LOUD = -20.0  # dB of change from sample to sample: a line has it only where it nearly clips
 
 Make: TypeAlias = tuple[float, float, bool]  # sample rate and carrier (Hz), I and Q: the same in all blocks
 
@@ -80,6 +86,7 @@ class SlidingSpectrum:
         self._settings = settings
         self._make: Make | None = None
         self._makes: JumpGate[Make] = JumpGate(0.0, apart, longest_gap=FORGOTTEN)
+        self._levels: JumpGate[float] = JumpGate(WILD, _louder, longest_gap=FORGOTTEN)
         self._last_ns: int | None = None  # stamp of the last block
         self._seen_ns: int | None = None  # the same, of one that was refused as well
         self.gaps = 0  # how many times samples were missing between blocks
@@ -101,7 +108,8 @@ class SlidingSpectrum:
             carrier: Hz.
 
         A block of another make than the ones before, for three blocks in a row at most, is one by mistake: where its
-        stamp fits its samples at the rate before, it is taken for one of that make, otherwise it counts as lost.
+        stamp fits its samples at the rate before, it is taken for one of that make, otherwise it counts as lost. So
+        does one that is louder by WILD.
 
         Raises:
             ValueError: a block that is not newer than the one before, or a rate that cannot hold the band or takes too
@@ -123,9 +131,13 @@ class SlidingSpectrum:
             return None
         if believed != self._make:
             self._prepare(believed)
-        self._forget_over_gap(stamp_ns, len(samples))
+        self._levels.update(stamp_ns, _level(samples))
+        if self._levels.holding:
+            return None
+        scaled = self._scaled(samples)
+        self._bridge_or_forget(stamp_ns, scaled)
         self._last_ns = stamp_ns
-        self._take(samples)
+        self._take(scaled, present=True)
         due = self._since_hop >= self._hop
         self._since_hop %= self._hop
         return self._spectrum(stamp_ns) if due and self._filled == len(self._kept) else None
@@ -145,6 +157,7 @@ class SlidingSpectrum:
         count = round(settings.window * sample_rate)
         self._make = make
         self._kept = np.zeros(count, dtype=np.complex128 if signed else np.float64)
+        self._present = np.zeros(count, dtype=bool)  # which of them were measured, and not bridged
         self._filled = 0
         # whatever is in the band changes within its period; a band that begins at 0 has no longest one
         self._longest_still = round(min(sample_rate / max(settings.lowest, 1e-9), 0.5 * count))
@@ -172,25 +185,37 @@ class SlidingSpectrum:
         rows = min(round(settings.floor_memory / (spacing * settings.hop)), MOST_ROWS)
         self._floor = NoiseFloor(rows, spacing, self._length / count)
 
-    def _forget_over_gap(self, stamp_ns: int, count: int) -> None:
-        """Start the window anew where samples are missing; half a block of jitter is none."""
+    def _bridge_or_forget(self, stamp_ns: int, scaled: NDArray[np.inexact]) -> None:
+        """A straight line where few samples are missing before these; where many are, the window begins anew."""
         if self._make is None or self._last_ns is None:
             return
+        count = len(scaled)
         elapsed = (stamp_ns - self._last_ns) * 1e-9 * self._make[0]  # samples
-        if elapsed > count + _jitter(count):
-            self.gaps += 1
+        if elapsed <= count + _jitter(count):
+            return
+        self.gaps += 1
+        missing = round(elapsed) - count
+        if missing <= BRIDGED * len(self._kept):
+            # without a step there, what is slow and strong does not spread over the band
+            line = np.linspace(self._kept[-1], scaled[0], missing + 2)[1:-1]
+            self._take(line, present=False)
+        else:
             self._filled = self._since_hop = 0
 
-    def _take(self, samples: NDArray[np.number]) -> None:
+    def _scaled(self, samples: NDArray[np.number]) -> NDArray[np.inexact]:
+        """The samples with a full scale of 1."""
         whole = samples.dtype.kind == "i"
-        scaled = samples / INT16_FULL_SCALE if whole else samples
         self._least_floor = STAIRCASE if whole else LEAST_POWER
+        return np.asarray(samples / INT16_FULL_SCALE if whole else samples)
+
+    def _take(self, scaled: NDArray[np.inexact], *, present: bool) -> None:
         size = len(self._kept)
         fresh = scaled[-size:]
-        self._kept[: size - len(fresh)] = self._kept[len(fresh) :].copy()
-        self._kept[size - len(fresh) :] = fresh
-        self._filled = min(self._filled + len(samples), size)
-        self._since_hop += len(samples)
+        for kept, new in ((self._kept, fresh), (self._present, present)):
+            kept[: size - len(fresh)] = kept[len(fresh) :].copy()
+            kept[size - len(fresh) :] = new
+        self._filled = min(self._filled + len(scaled), size)
+        self._since_hop += len(scaled)
 
     def _spectrum(self, stamp_ns: int) -> DopplerSpectrum:
         assert self._make is not None
@@ -199,7 +224,7 @@ class SlidingSpectrum:
         silent = still >= self._longest_still
         power, below = np.zeros(len(self._bins)), 0.0
         if not silent:
-            windowed = (samples - samples.mean()) * self._hann
+            windowed = (samples - samples.mean()) * self._hann * self._filling()
             transform = fft.fft(windowed, self._length) if signed else fft.rfft(windowed, self._length)
             power = self._power(transform[self._bins])
             below = float(self._power(transform[self._below]).max(initial=0.0))
@@ -224,6 +249,12 @@ class SlidingSpectrum:
             elapsed=elapsed,
         )
 
+    def _filling(self) -> float:
+        """By what a line's amplitude grows again that has lost what was bridged."""
+        if self._present.all():
+            return 1.0
+        return float(self._hann.sum() / self._hann[self._present].sum())
+
     def _power(self, lines: NDArray[np.complex128]) -> NDArray[np.float64]:
         power: NDArray[np.float64] = self._scale * (lines.real**2 + lines.imag**2)
         return power
@@ -239,6 +270,19 @@ class SlidingSpectrum:
 def apart(one: Make, other: Make) -> float:
     """0 for the same make, 1 for another."""
     return float(one != other)
+
+
+def _level(samples: NDArray[np.number]) -> float:
+    """Of a block, dB: its median change from sample to sample, which single impulses and steps leave as it is."""
+    if len(samples) < 2:
+        return LOUD
+    scaled = samples * np.float64(1.0 / INT16_FULL_SCALE if samples.dtype.kind == "i" else 1.0)
+    return 20.0 * math.log10(max(float(np.median(np.abs(scaled[1:] - scaled[:-1]))), LEAST_POWER))
+
+
+def _louder(now: float, before: float) -> float:
+    """By how many dB a loud block is louder than the one before."""
+    return now - before if now > LOUD else 0.0
 
 
 def _jitter(count: float) -> float:
