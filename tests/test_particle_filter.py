@@ -60,7 +60,7 @@ def test_it_finds_what_the_kalman_filter_finds() -> None:
         variance += q * q
         gain = variance / (variance + r * r)
         mean, variance = mean + gain * (seen - mean), (1.0 - gain) * variance
-        particles.states = particles.states + q * random.standard_normal(particles.states.shape)
+        particles.states += (q * random.standard_normal(particles.states.shape)).astype(np.float32)
         particles.weigh(-0.5 * ((seen - particles.states[0]) / r) ** 2)
         found = weighted_covariance(particles.states, particles.weights)[0, 0]
         off.append((float(particles.mean()[0]) - mean) / math.sqrt(variance))

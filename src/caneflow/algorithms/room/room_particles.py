@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from caneflow.algorithms.quantities import Angle, Decibels, Density, Factor, Fraction, Probability, Speed, Time, Zero
 from caneflow.algorithms.room.particle_filter import (
+    Narrow,
     Particles,
     ParticleSettings,
+    noise,
     normal_with_outliers,
     student_t,
     weighted_covariance,
@@ -121,7 +123,7 @@ class _RoomParticles(ABC):
         """States at the start, shape (D, count); the first two are the position."""
 
     @abstractmethod
-    def _velocities(self) -> Array:
+    def _velocities(self) -> Narrow:
         """Of each particle at the time it stands at, shape (2, N), m/s."""
 
     @abstractmethod
@@ -148,14 +150,14 @@ class _RoomParticles(ABC):
         else:
             self._hold(dt)
             spread = self._settings.hold_noise * math.sqrt(dt)
-            self._particles.states[:2] += spread * self._random.standard_normal((2, self._particles.states.shape[1]))
+            self._particles.states[:2] += spread * noise(self._random, 2, self._particles.states.shape[1])
         self._now_ns = stamp_ns
 
     def _weigh(self, sensor: StaticSensor, echo: Echo) -> None:
         s = self._settings
         x, y = self._particles.states[0] - sensor.position[0], self._particles.states[1] - sensor.position[1]
         distance = np.maximum(np.sqrt(x * x + y * y), LEAST_DISTANCE)
-        weight = np.zeros(len(distance))
+        weight = np.zeros(len(distance), dtype=np.float32)
         if echo.range is not None and self._consistent(echo.range - distance, s.range_error):
             weight += normal_with_outliers(echo.range - distance, s.range_error, s.speed_outliers, 3.0)
         if s.use_strength and echo.strength is not None and sensor.k is not None:
@@ -177,7 +179,7 @@ class _RoomParticles(ABC):
             weight -= s.edge_share * np.maximum(beyond, 0.0) ** 2
         self._particles.weigh(weight)
 
-    def _consistent(self, residuals: Array, error: float) -> bool:
+    def _consistent(self, residuals: Narrow, error: float) -> bool:
         """Whether any particle could have been measured so; counts what none could."""
         fits = bool((np.abs(residuals) < self._settings.consistent * error).any())
         self.discarded += not fits
@@ -185,7 +187,7 @@ class _RoomParticles(ABC):
 
     def _roughen(self) -> None:
         states = self._particles.states
-        states[:2] += self._settings.roughening * self._random.standard_normal((2, states.shape[1]))
+        states[:2] += self._settings.roughening * noise(self._random, 2, states.shape[1])
 
 
 class ParticleTracker(_RoomParticles):
@@ -195,12 +197,12 @@ class ParticleTracker(_RoomParticles):
         velocities = self._settings.start_speed * self._random.standard_normal((2, count))
         return np.concatenate([start.drawn(count, self._random), velocities])
 
-    def _velocities(self) -> Array:
+    def _velocities(self) -> Narrow:
         return self._particles.states[2:]
 
     def _move(self, stamp_ns: int, dt: float) -> None:
         s, states = self._settings, self._particles.states
-        states[2:] += s.walk_noise * math.sqrt(dt) * self._random.standard_normal((2, states.shape[1]))
+        states[2:] += s.walk_noise * math.sqrt(dt) * noise(self._random, 2, states.shape[1])
         speed = np.maximum(np.sqrt(states[2] ** 2 + states[3] ** 2), 1e-9)
         if speed.max() > s.fastest:
             states[2:] *= np.minimum(1.0, s.fastest / speed)
@@ -240,7 +242,7 @@ class HeadingParticleTracker(_RoomParticles):
             [start.drawn(count, self._random), speed[None], s.heading_error * self._random.standard_normal((1, count))]
         )
 
-    def _velocities(self) -> Array:
+    def _velocities(self) -> Narrow:
         yaw = self._yaw() + self._particles.states[3]
         speed = self._particles.states[2]
         return np.stack([speed * np.cos(yaw), speed * np.sin(yaw)])
@@ -261,11 +263,11 @@ class HeadingParticleTracker(_RoomParticles):
             states[1] += states[2] * (sine * travel.east + cosine * travel.north)
             keep = math.exp(-dt / s.heading_time)
             states[3] *= keep
-            states[3] += s.heading_error * math.sqrt(1.0 - keep * keep) * self._random.standard_normal(shape)
+            states[3] += s.heading_error * math.sqrt(1.0 - keep * keep) * noise(self._random, shape)
         else:
             states[:2] += dt * self._velocities()
-            states[3] += s.turn_noise * math.sqrt(dt) * self._random.standard_normal(shape)
-        states[2] += s.along_noise * math.sqrt(dt) * self._random.standard_normal(shape)
+            states[3] += s.turn_noise * math.sqrt(dt) * noise(self._random, shape)
+        states[2] += s.along_noise * math.sqrt(dt) * noise(self._random, shape)
         np.abs(states[2], out=states[2])
         np.minimum(states[2], s.fastest, out=states[2])
 
@@ -295,9 +297,9 @@ class HeadingParticleTracker(_RoomParticles):
         return RoomEstimate((x, y), (u, v), weighted_covariance(values, particles.weights))
 
 
-def expected_strength(sensor: StaticSensor, k: float, x: Array, y: Array, distance: Array) -> Array:
+def expected_strength(sensor: StaticSensor, k: float, x: Narrow, y: Narrow, distance: Narrow) -> Narrow:
     """dB, of an echo from (x, y) m off the sensor, `distance` away: k / R^4 and the antenna's pattern; shape (N,)."""
     # cosine of the angle off the boresight, without an arctangent
     cosine = (x * math.cos(sensor.azimuth) + y * math.sin(sensor.azimuth)) / distance
     log_pattern = PATTERN_EXPONENT * np.log(np.maximum(cosine, LEAST_COSINE))
-    return np.asarray(DECIBEL * (math.log(k) + log_pattern - 4.0 * np.log(distance)), dtype=np.float64)
+    return np.asarray(DECIBEL * (math.log(k) + log_pattern - 4.0 * np.log(distance)), dtype=np.float32)
