@@ -157,6 +157,9 @@ class _Builders:
         self._types = types
         self._unknown = np.zeros(9)  # there, of unknown accuracy
         self._absent = np.array([ABSENT, *(0.0,) * 8])
+        # One pose fills several topics: what they share is made once.
+        self._placed_of: Pose | None = None
+        self._placed: Any = None
 
     def imu(self, imu: Imu) -> Any:
         return self._types[IMU_TYPE](
@@ -180,7 +183,9 @@ class _Builders:
         )
 
     def pose(self, pose: Pose, frames: Frames) -> Any:
-        return self._types[POSE_TYPE](header=self.header(pose.stamp, frames.world), pose=self.place(pose, frames))
+        return self._types[POSE_TYPE](
+            header=self.header(pose.stamp, frames.world), pose=self.uncertain_place(pose, frames).pose
+        )
 
     def odometry(self, pose: Pose, frames: Frames, child: str) -> Any:
         back = conjugate(frames.base(pose.orientation))
@@ -188,7 +193,7 @@ class _Builders:
         return self._types[ODOMETRY_TYPE](
             header=self.header(pose.stamp, frames.world),
             child_frame_id=child,
-            pose=self._pose_covariance(pose=self.place(pose, frames), covariance=place_covariance(pose)),
+            pose=self.uncertain_place(pose, frames),
             twist=self._twist_covariance(
                 twist=self._twist(linear=linear, angular=angular), covariance=motion_covariance(pose, back)
             ),
@@ -199,7 +204,7 @@ class _Builders:
             return None
         return self._types[POSE_COVARIANCE_TYPE](
             header=self.header(pose.stamp, frames.world),
-            pose=self._pose_covariance(pose=self.place(pose, frames), covariance=place_covariance(pose)),
+            pose=self.uncertain_place(pose, frames),
         )
 
     def moving(self, pose: Pose, frames: Frames) -> Any:
@@ -302,10 +307,15 @@ class _Builders:
         row = self._types["diagnostic_msgs/msg/DiagnosticStatus"]
         return row(level=level, name=name, message=message, hardware_id=hardware, values=pairs)
 
-    def place(self, pose: Pose, frames: Frames) -> Any:
-        x, y, z = map(float, pose.position)
-        turn = self.quaternion(frames.base(pose.orientation))
-        return self._pose(position=self._point(x=x, y=y, z=z), orientation=turn)
+    def uncertain_place(self, pose: Pose, frames: Frames) -> Any:
+        """The geometry_msgs/PoseWithCovariance of a pose."""
+        if pose is not self._placed_of:
+            x, y, z = map(float, pose.position)
+            turn = self.quaternion(frames.base(pose.orientation))
+            place = self._pose(position=self._point(x=x, y=y, z=z), orientation=turn)
+            self._placed = self._pose_covariance(pose=place, covariance=place_covariance(pose))
+            self._placed_of = pose
+        return self._placed
 
     def header(self, stamp: int, frame: str) -> Any:
         seconds, nanoseconds = divmod(stamp, 10**9)

@@ -38,13 +38,19 @@ class Outlet:
         self._watched = watched
         self._patient = patient
         self._settled_at = time.monotonic() + SETTLING
+        # Zenoh tells of changes: to ask it costs a sample's whole handling, as it hands its receiving thread over.
+        self._matching = False
+        if watched:
+            told = zenoh.handlers.Callback(self._take_status, indirect=False)
+            self.listener = publisher.declare_matching_listener(told)
+            self._matching = publisher.matching_status.matching
 
     @property
     def is_heard(self) -> bool:
         """Whether somebody listens, as far as this session knows; in its first second: yes."""
         if not self._watched:
             return True
-        while not self._publisher.matching_status.matching:
+        while not self._matching:
             if time.monotonic() >= self._settled_at:
                 return False
             if not self._patient:
@@ -55,6 +61,9 @@ class Outlet:
     def put(self, payload: bytes, attachment: bytes) -> None:
         """Send one message."""
         self._publisher.put(payload, attachment=attachment)
+
+    def _take_status(self, status: zenoh.MatchingStatus) -> None:
+        self._matching = status.matching
 
 
 class Neighbour:
