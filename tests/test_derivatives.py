@@ -96,3 +96,19 @@ def test_tracks_made_again_from_knots_are_those_that_grew_step_by_step() -> None
         grew = np.interp(hypotheses._biases[scale::scales], biases[scale::scales], tracks[scale::scales])
         inside = np.abs(hypotheses._biases[scale::scales]) <= np.abs(biases).max()
         assert np.abs(hypotheses._tracks[scale::scales] - grew)[inside].max() < 0.02
+
+
+@pytest.mark.parametrize("beta", [-0.1, 0.1])
+def test_the_angle_between_where_a_cane_points_and_its_bearer_walks_is_learnt(beta: float) -> None:
+    """A radar that sees both components at 1 m/s; a rule of the wrong sign would settle at a third of the angle."""
+    cane: Any = CaneFilter(CaneFilterSettings(), boresight=(0.0, 1.0, 0.0), pivot=(0.0, 0.0, 0.0))
+    bob = 0.5  # m/s^2, up and down: who walks does
+    for index in range(3000):
+        stamp_ns = 10_000_000 * (index + 1)
+        up = bob * math.sin(0.12 * index)
+        reading = ImuReading(
+            (0.0, 0.0, 0.0), mag=(0.0, 20.0, -40.0), orientation=from_yaw(0.0), linear_accel=(0.0, 0.0, up)
+        )
+        cane.imu(stamp_ns, reading)
+        cane.velocity(stamp_ns, (math.cos(beta), math.sin(beta)), (1e-4, 0.0, 1e-4), 0.0)
+    assert cane._motion.pointing == pytest.approx(beta, abs=0.02)

@@ -209,3 +209,33 @@ def test_only_what_a_reader_puts_in_order_with_other_streams_is_awaited(tmp_path
     awaited = {out.key for plan in plans.values() for out in plan.outputs.values() if out.awaited}
     assert awaited == {"cane/imu/imu", "cane/radar/frame", "cane/ground_speed/speed"}
     assert plans["fusion"].outputs["pose"].readers == ("recorder",)
+
+
+@pytest.mark.parametrize(
+    ("fault", "lines", "words"),
+    [
+        ("raise KeyError('nothing')", 5, "KeyError: 'nothing'"),
+        ("yield 'sean', message", 1, "emitted on port 'sean'; it has seen"),
+    ],
+)
+def test_in_one_process_a_fault_of_an_operator_names_its_node_and_sample(
+    flow: Path, tmp_path: Path, fault: str, lines: int, words: str
+) -> None:
+    """The operator's own lines of the traceback, and none of ours."""
+    operator = tmp_path / "order.py"
+    operator.write_text(
+        ORDER.replace("        # Stamps of", f"        if message.seq == 7:\n            {fault}\n        # Stamps of")
+    )
+    recording = recorded(tmp_path / "in.mcap", CASES["equal stamps"])
+    done = caneflow_here("run", flow, "--replay", recording, "--in-process")
+    said = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert said[-1] == f"caneflow run: order failed at a seq 7: {words}"
+    assert len(said) == lines
+    assert all("caneflow/runtime" not in line for line in said)
+
+
+def test_a_recording_is_not_named_as_something_else(tmp_path: Path) -> None:
+    done = caneflow_here("run", "dataflow.yaml", "--replay", tmp_path / "walk.mcap", "--record", tmp_path / "out.txt")
+    assert done.returncode == 2
+    assert done.stderr == f"caneflow run: --record: {tmp_path}/out.txt: a recording's name ends with .mcap\n"

@@ -95,3 +95,12 @@ def test_likelihoods_are_densities() -> None:
     # Student's t with 4 degrees of freedom: variance 2, up to the tails that are cut off
     heavy = np.exp(student_t(at, 1.0, 4.0))
     assert (at**2 * heavy).sum() / heavy.sum() == pytest.approx(2.0, rel=0.02)
+
+
+def test_small_particles_are_removed_before_the_others_are_resampled() -> None:
+    """Half of them at 0.4 of the mean weight, the limit at 0.5: a fifth would live on without it."""
+    states = np.repeat([[1.0, 2.0]], 500, axis=0).T.reshape(1, -1)  # 500 of 1, then 500 of 2
+    particles = Particles(states, ParticleSettings(count=1000, smallest=0.5, resample_below=1.0))
+    particles.weights = np.repeat([1.6, 0.4], 500) / 1000
+    assert particles.renew(np.random.default_rng(4))
+    assert set(particles.states[0].tolist()) == {1.0}

@@ -448,3 +448,16 @@ def distance_to_triangle(point: np.ndarray) -> float:
         return float(np.linalg.norm(point - a - along * (b - a)))
 
     return min(to(a, b) for a, b in itertools.pairwise(TRIANGLE))
+
+
+def test_outside_of_the_area_a_particle_is_less_likely_with_the_square_of_the_distance() -> None:
+    """An echo that says nothing else, so that what the edge does to the weights stands alone."""
+    settings = RoomParticleSettings(use_speed=False, use_strength=False, edge_share=0.5)
+    start = RoomStart(guess=(7.9, 0.1), error=1.0, area=AREA)
+    tracker: Any = ParticleTracker(settings, SENSORS, start, np.random.default_rng(6))
+    tracker.echo("south", Echo(stamp_ns=START_NS, valid=True, range_rate=0.5))
+    x, y = tracker._particles.states[:2].astype(float)
+    beyond = np.maximum.reduce([-x, x - 8.0, -y, y - 8.0, np.zeros_like(x)])
+    assert (beyond > 0.5).sum() > 1000
+    expected = np.exp(-0.5 * beyond**2)
+    np.testing.assert_allclose(tracker._particles.weights, expected / expected.sum(), rtol=1e-4)

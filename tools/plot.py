@@ -132,9 +132,9 @@ def command(
     form = output.suffix[1:]
     with whole(output, inputs=[recording], overwrite=overwrite, picture=form) as path:
         picture = read_picture(recording)
+        for line in (*summary(picture), *shown(picture)):
+            print(line, flush=True)  # to draw takes a few seconds more
         draw(picture).savefig(path, dpi=150, format=form)
-    for line in (*summary(picture), *shown(picture)):
-        print(line)
 
 
 def shown(picture: Picture) -> Iterator[str]:

@@ -24,7 +24,7 @@ from caneflow.runtime.dataflow.loading import load, read_rig
 from caneflow.runtime.dataflow.topology import NOBODY_LISTENS
 from caneflow.runtime.deployment import Deployment, deploy
 from caneflow.runtime.errors import DataflowError
-from caneflow.runtime.hosts.in_process import InProcess
+from caneflow.runtime.hosts.in_process import InProcess, failure_of
 from caneflow.runtime.hosts.launcher.console import Console
 from caneflow.runtime.hosts.launcher.replay_progress import ReplayProgress
 from caneflow.runtime.outcome import Outcome, troubles
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from caneflow.runtime.hosts.as_processes import AsProcesses
 
 SLOWEST, FASTEST = 1e-3, 1e6  # times real time: 17 min for a second; a year in half a minute, faster than any computer
+RECORDING = ".mcap"
 LONGEST = 1e9  # s: 32 years
 
 
@@ -117,7 +118,7 @@ def command(
     processes = None if in_process else _processes(detach=detach)
     recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
     if record is not None:
-        record = named_at(record, datetime.now(UTC))
+        record = named_at(_named_as_recording(record), datetime.now(UTC))
     # The recording's name first, before any process; then the fork server: what is there now is there in every node.
     with (
         _kept(record, [file, replay, rig], overwrite=overwrite, parts=bool(recorder)),
@@ -152,6 +153,12 @@ def command(
         raise typer.Exit(outcome.status)
 
 
+def _named_as_recording(record: Path) -> Path:
+    if record.suffix not in ("", RECORDING):  # a device has none
+        raise DataflowError(f"--record: {record}: a recording's name ends with {RECORDING}")
+    return record
+
+
 def _processes(*, detach: bool) -> "AsProcesses":
     # Imported here, as it takes Linux and Zenoh; --in-process takes neither.
     from caneflow.runtime.hosts.as_processes import AsProcesses
@@ -167,6 +174,14 @@ def _run_here(graph: Graph, deployment: Deployment) -> Outcome:
         with Console(deployment.flow) as console:
             progress = ReplayProgress(deployment.origin, deployment.last, console.played)
             return host.run_until_interrupted(lambda stamp: progress.look((stamp,)))
+    except Exception as error:
+        failure = failure_of(error)
+        if failure is None:
+            raise
+        for line in failure.lines:
+            print(line, file=sys.stderr)
+        print(f"caneflow run: {failure.node} failed at {failure.at}: {failure.error}", file=sys.stderr)
+        raise typer.Exit(1) from error
     finally:
         gc.unfreeze()
 

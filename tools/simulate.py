@@ -1,6 +1,8 @@
 """`caneflow simulate`: recordings of walks that nobody walked, with the truth beside them."""
 
 import math
+import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -29,6 +31,7 @@ from caneflow.simulation.room_course import RoomShape
 from caneflow.simulation.room_scenario import PARTS, SENSORS, Part, RoomRecording, World, room_settings, simulate_room
 from caneflow.simulation.scenario import SCENARIOS, Walk, WalkSettings, simulate_walk, walk_settings
 
+SAY_PERIOD = 4.0  # s between two lines that say how far a simulation is, where there is no terminal
 RECORDING = ".mcap"  # the end of a file's name; another output of `simulate room` is a folder
 CANE, ROOM, CANE_IN_ROOM = "cane", "room", "cane_in_room"  # flows
 CANE_A121, CANE_MMWAVE = "cane_a121", "cane_mmwave"  # likewise
@@ -555,11 +558,26 @@ def true_pose(simulated: Walk | RadarWalk | RoomRecording, i: int) -> Pose:
 
 @contextmanager
 def progress_bar(text: str) -> Iterator[Callable[[float], None]]:
-    """A function that is told the part done, 0..1; it draws a bar on a terminal and nothing elsewhere."""
+    """A function that is told the part done, 0..1: a bar on a terminal, elsewhere a line now and then."""
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    if not console.is_terminal:
+        yield _lines_of_progress(text)
+        return
+    with Progress(console=console, transient=True) as bar:
         task = bar.add_task(text, total=1.0)
         yield lambda done: bar.update(task, completed=done)
+
+
+def _lines_of_progress(text: str) -> Callable[[float], None]:
+    said_at = time.monotonic()
+
+    def tell(done: float) -> None:
+        nonlocal said_at
+        if time.monotonic() - said_at >= SAY_PERIOD:
+            said_at = time.monotonic()
+            print(f"{text}: {done:.0%}", file=sys.stderr, flush=True)
+
+    return tell
 
 
 commands = {"walk": walk, "room": room, "cane_in_room": cane_in_room}

@@ -6,11 +6,13 @@ give the same bytes.
 
 import heapq
 import importlib
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
 from itertools import islice
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
+from caneflow.errors import CaneflowError
 from caneflow.messages import Sample
 from caneflow.runtime.building import build
 from caneflow.runtime.deployment import RECORDER_MODULE, Deployment
@@ -20,6 +22,8 @@ from caneflow.runtime.plan import NodePlan
 from caneflow.runtime.program import Encoded, Program, Quiet, Source
 from caneflow.runtime.replayed import REPLAYER_MODULE
 from caneflow.runtime.stages.group import Group, in_order
+from caneflow.runtime.stages.operator_stage import Stage
+from caneflow.runtime.wording import one_line
 
 Arriving: TypeAlias = tuple[str, str, Sample | Encoded]  # node, port, sample
 
@@ -94,6 +98,31 @@ class InProcess:
     def _step(self) -> None:
         while self._group.step() is not None:
             pass
+
+
+class Failure(NamedTuple):
+    """An exception of an operator, where it happened."""
+
+    node: str
+    at: str  # the sample, e.g. "imu seq 9"
+    lines: tuple[str, ...]  # the traceback, from the operator's own frame on
+    error: str
+
+
+def failure_of(error: Exception) -> Failure | None:
+    """What an operator raised while it handled a sample; None for an exception that came from elsewhere."""
+    place = error.__traceback__
+    while place is not None:
+        local = place.tb_frame.f_locals
+        stage, message = local.get("self"), local.get("message")
+        if place.tb_frame.f_code.co_name == "_handled" and isinstance(stage, Stage) and place.tb_next is not None:
+            lines = "".join(traceback.format_exception(type(error), error, place.tb_next)).rstrip().splitlines()
+            at = f"{local['port']} seq {message.seq}" if isinstance(message, Sample) else str(local["port"])
+            if isinstance(error, CaneflowError):
+                return Failure(stage.node, at, (), one_line(str(error).removeprefix(f"{stage.node}: ")))
+            return Failure(stage.node, at, tuple(lines), one_line(f"{type(error).__name__}: {error}"))
+        place = place.tb_next
+    return None
 
 
 def _at_its_stamp(node: str, port: str, message: Sample) -> int:
