@@ -321,9 +321,15 @@ def test_the_rig_of_the_flow_is_sound() -> None:
 GUIDE = ROOT / "dataflows" / "guide.yaml"
 
 
-def test_check_warns_of_a_pose_that_is_not_good_enough_for_a_map() -> None:
+def test_check_warns_of_a_pose_that_is_not_good_enough_for_a_map(tmp_path: Path) -> None:
     assert not any("method" in str(problem) for problem in examine(GUIDE)[1])
-    graph, problems = examine(GUIDE, ["fusion.method=luenberger"])
+    path = tmp_path / "guide.yaml"
+    path.write_text(
+        GUIDE.read_text()
+        .replace("method: best, with_local: true", "method: luenberger")
+        .replace("fusion/local", "fusion/pose")
+    )
+    graph, problems = examine(path)
     assert graph is not None
     (said,) = [str(problem) for problem in problems if "method" in str(problem)]
     assert "warning: nodes.surroundings.inputs.pose: comes from the method luenberger" in said
