@@ -8,7 +8,7 @@ REPEATS ?= 3
 # `make test LOCKED=1`: the very versions of constraints.txt, with which all tests passed; otherwise the newest that fit.
 LOCK := $(if $(LOCKED),--constraint constraints.txt)
 
-# Flows are started by the hundred: each process would compile every module anew where this is set.
+# Flows are started by the hundred: each process would compile every module again where this is set.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test lint lock docs compiled soak bench real mcu-test clean
@@ -53,7 +53,7 @@ lint: $(BIN)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# constraints.txt anew: the newest versions that fit, to be committed once all tests pass with them.
+# constraints.txt again: the newest versions that fit, to be committed once all tests pass with them.
 lock: $(BIN)/.installed
 	$(BIN)/pip install --quiet --dry-run --ignore-installed --report - --editable '.[dev]' | $(BIN)/python .ci/lock.py > constraints.txt
 

@@ -190,7 +190,7 @@ def hear_foxglove(port: int) -> None:
 
 
 def answer(stamps: list[int]) -> None:
-    """Say what was heard, whenever somebody asks."""
+    """Say what was heard, whenever someone asks."""
     for _ in sys.stdin:
         print(json.dumps(stamps), flush=True)
     os._exit(0)

@@ -22,7 +22,7 @@ class Job:
     kind: str  # of KINDS
     rate: float  # Hz; 0: as fast as it goes, nothing dropped
     count: int  # samples
-    wait: bool = True  # the source begins once somebody listens
+    wait: bool = True  # the source begins once someone listens
     size: int = 0  # bytes of a "bytes" sample
     folder: str = ""  # where the sink puts its notes, and sockets lie
 
@@ -69,7 +69,7 @@ def samples(job: Job) -> Iterator[Sample]:
 
 
 def relayed(job: Job) -> Callable[[bytes], bytes]:
-    """The relay's work: decoded with all checks, numbered anew, encoded."""
+    """The relay's work: decoded with all checks, numbered again, encoded."""
     kind = KINDS[job.kind]
 
     def relay(payload: bytes) -> bytes:

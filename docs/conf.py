@@ -33,6 +33,6 @@ myst_heading_anchors = 3
 html_theme = "furo"
 html_title = "caneflow"
 exclude_patterns = ["performance_peers.md", "performance_scaling.md"]  # parts of performance.md
-suppress_warnings = ["myst.xref_missing"]  # links to files of the repository that are no pages of the site
+suppress_warnings = ["myst.xref_missing"]  # links to files of the repository that are not pages of the site
 
 reference_pages.write(Path(__file__).parent / "reference")

@@ -30,7 +30,7 @@ from caneflow.runtime.node import run
 log = logging.getLogger(__name__)
 
 ANSWER_TIME = 1.0  # s; a setup calibrates the sensor, which takes some 0.2 s
-SILENCE = 0.5  # s without a frame, and at least SILENT_FRAMES of them, after which the radar is started anew
+SILENCE = 0.5  # s without a frame, and at least SILENT_FRAMES of them, after which the radar is started again
 SILENT_FRAMES = 4
 SAYING = 0.25  # s after which the driver says that nothing comes
 RETRY = 0.25  # s between two attempts at a radar that is not there
@@ -262,7 +262,7 @@ class Framing:
 
 
 class A121(Source):
-    """Sets the radar up, brings its frames, sets it up anew when it asks for that, and stops it on every way out."""
+    """Sets the radar up, brings its frames, sets it up again when it asks for that, and stops it on every way out."""
 
     outputs = {"frame": RadarFrame}
     Settings = A121Settings

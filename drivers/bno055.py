@@ -41,7 +41,7 @@ LOST: tuple[type[Exception], ...] = (
 )  # what a port or a chip that is gone raises
 RETRY = 0.05  # s between two looks for a chip that is gone
 START_PATIENCE = 1.5  # s that a chip may take to start, twice what the data sheet says
-SILENCE = 0.3  # s without an answer, after which the port is opened anew
+SILENCE = 0.3  # s without an answer, after which the port is opened again
 IN_DOUBT_AFTER = 0.25  # s without a sample, after which the chip is asked for its state
 ASK_AGAIN = 0.5  # s
 REVIVAL_PERIOD = 5.0  # s between two attempts to get a chip going whose values stand still
@@ -65,7 +65,7 @@ class Bno055Settings:
     accel_and_mag: bool = True  # read these too; without them I2C with clock stretching keeps up with 100 Hz
     calibration_file: str | None = None  # given to the chip at the start, written at the end when it is calibrated
     answer_timeout_ms: Milliseconds = 30.0  # ms; an adapter on USB may hold an answer back for 16
-    start_timeout_s: Time = 10.0  # s to the first sample; later the chip is waited for for ever
+    start_timeout_s: Time = 10.0  # s to the first sample; later the chip is waited for forever
 
     def __post_init__(self) -> None:
         try:
@@ -246,7 +246,7 @@ class Bno055(Source):
         """Find out why there are no samples; raises ProtocolError when something can be done about it."""
         state = chip.state()
         if not chip.works_as(self._setup):
-            raise ProtocolError(f"the chip was reset: {state}; is set up anew")
+            raise ProtocolError(f"the chip was reset: {state}; is set up again")
         what = "the values stand still" if verdict is Verdict.FROZEN else self._dropped
         now = time.monotonic()
         if now > self._next_revival:
@@ -330,7 +330,7 @@ class Report:
             self.tell(now)
 
     def tell(self, now: float) -> None:
-        """Log one line and begin anew."""
+        """Log one line and begin again."""
         self._collect()
         if self._readings:
             log.info("%s", self._line())

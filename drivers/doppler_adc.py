@@ -28,7 +28,7 @@ from caneflow.runtime.node import run
 
 log = logging.getLogger(__name__)
 
-SILENCE = 0.5  # s without a frame after which the card is opened anew
+SILENCE = 0.5  # s without a frame after which the card is opened again
 RETRY = 0.25  # s between two looks for a card that is gone
 MOST_WAITING = 256  # pieces, as the card hands them over, that wait for this process: 2 s of usual ones of 8 ms
 HAND_OVER = 0.1  # s
@@ -54,7 +54,7 @@ class DopplerAdcSettings:
     sample_format: Literal["int16", "float32"] = "int16"  # of a device; float32 where the ADC has more than 16 bits
     carrier: Annotated[float, Ge(bounds.CARRIER[0]), Le(bounds.CARRIER[1])] = 24.125e9  # Hz
     block: Annotated[float, Ge(1e-3), Le(10)] = 0.05  # s
-    start_timeout_s: Time = 10.0  # s to the first block; later the device is waited for for ever
+    start_timeout_s: Time = 10.0  # s to the first block; later the device is waited for forever
 
     def __post_init__(self) -> None:
         if self.quadrature == self.channel:
@@ -91,7 +91,7 @@ class StreamClock:
         self.restart()
 
     def restart(self) -> None:
-        """Begin the count anew: frames are missing, nobody knows how many."""
+        """Begin the count again: frames are missing, nobody knows how many."""
         self._line = LineBelow(ClockFitSettings())
         self._count = 0
 
@@ -121,7 +121,7 @@ class DopplerAdc(Source):
         self._offset = time.time_ns() - time.monotonic_ns()  # of the Unix epoch
         self._said = ""  # the last warning
         self._blocks = self._overflows = self._overflows_told = 0
-        self._refused = self._refused_told = 0  # blocks with what is no sound
+        self._refused = self._refused_told = 0  # blocks with what is not sound
         self._next_report = 0.0  # s, monotonic
         self._quiet: dict[int, float] = {}  # by silent channel, s without a change
 
@@ -175,7 +175,7 @@ class DopplerAdc(Source):
                 time.sleep(wait)
             yield from self._block(samples, began + round(taken * 1e9), sound.sample_rate)
         if refused := sound.refused + self._refused:
-            log.warning("%s: %d blocks left out: they hold what is no number, or no sound", path, refused)
+            log.warning("%s: %d blocks left out: they hold what is not a number, or no sound", path, refused)
 
     def _block(self, samples: Samples, stamp: int, sample_rate: float | None = None) -> Brought:
         """A block of them, unless they hold what no converter says: NaN, or floats far beyond full scale."""

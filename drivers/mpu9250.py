@@ -33,9 +33,9 @@ log = logging.getLogger(__name__)
 LOST = (OSError, ProtocolError)  # what a bus or a chip that is gone raises
 FASTER = 1.02  # readings for each value: the chip's clock may be 1 % off
 RETRY = 0.1  # s between two looks for a chip that is gone
-SILENCE = 0.3  # s without an answer, after which the bus is opened anew
-MAG_PATIENCE = 0.5  # s without a word of the magnetometer, after which the chip is set up anew
-SATURATED_PATIENCE = 5.0  # s of readings at the end of a range, after which the chip is set up anew
+SILENCE = 0.3  # s without an answer, after which the bus is opened again
+MAG_PATIENCE = 0.5  # s without a word of the magnetometer, after which the chip is set up again
+SATURATED_PATIENCE = 5.0  # s of readings at the end of a range, after which the chip is set up again
 REVIVAL_PERIOD = 5.0  # s between two attempts to get a chip going whose values stand still
 REPORT_PERIOD = 60.0  # s
 WIDER = "gyro_range and accel_range may be wider (docs/hardware.md)"
@@ -62,7 +62,7 @@ class Mpu9250Settings:
         0.0,
     )  # uT, body: what steel on the belt adds; is taken off
     axes: str = "+x+y+z"  # the chip's axes (gyro's and accelerometer's) that are the body's x, y, z
-    start_timeout_s: Time = 10.0  # s to the first sample; later the chip is waited for for ever
+    start_timeout_s: Time = 10.0  # s to the first sample; later the chip is waited for forever
 
     def __post_init__(self) -> None:
         try:
@@ -70,7 +70,7 @@ class Mpu9250Settings:
         except ProtocolError as error:
             raise ValueError(f"axes: {error}") from error
         if not all(map(math.isfinite, self.mag_offset)):
-            raise ValueError(f"mag_offset is {self.mag_offset}; NaN and infinity are no field")
+            raise ValueError(f"mag_offset is {self.mag_offset}; NaN and infinity are not a field")
 
 
 class Mpu9250(Source):
@@ -173,7 +173,7 @@ class Mpu9250(Source):
                 self._report()
 
     def _checked(self, reading: Reading, told: float, now: float) -> float:
-        """When the magnetometer last said something, s; raises ProtocolError for a chip that is to be set up anew."""
+        """When the magnetometer last said something, s; raises ProtocolError for a chip that is to be set up again."""
         if reading.said.was_reset:
             raise ProtocolError("the chip was reset")
         if reading.said.magnetometer_works or not self._settings.magnetometer:
@@ -189,7 +189,7 @@ class Mpu9250(Source):
         self._saturated[what] += 1
 
     def _require_change(self, now: float) -> None:
-        """Raise ProtocolError now and then while the values stand still, which sets the chip up anew."""
+        """Raise ProtocolError now and then while the values stand still, which sets the chip up again."""
         if now > self._next_revival:
             raise ProtocolError("the values stand still")
 

@@ -84,7 +84,7 @@ class P440Settings:
     # Hz, effective centre of the received band; default: 4.3 GHz until it has been measured on echoes that move
     carrier: Annotated[float, Ge(bounds.CARRIER[0]), Le(bounds.CARRIER[1])] | None = None
     bandwidth: Annotated[float, Ge(bounds.BANDWIDTH[0]), Le(bounds.BANDWIDTH[1])] = 1.7e9  # Hz, at -10 dB
-    silence_s: Time = 0.5  # s without a packet after which the radar is started anew
+    silence_s: Time = 0.5  # s without a packet after which the radar is started again
 
     def __post_init__(self) -> None:
         if self.scan_stop_ps <= self.scan_start_ps:
@@ -253,7 +253,7 @@ class Radar:
         raise Silent(f"no answer within {tries * ANSWER_TIME:g} s")
 
     def start(self, period_us: int) -> int:
-        """Let it scan for ever; its status. That it scans is an answer as well, when the other one gets lost."""
+        """Let it scan forever; its status. That it scans is an answer as well, when the other one gets lost."""
         self._early.clear()
         request = mrm.ControlRequest(message_id=0, scan_count=mrm.SCAN_COUNT_FOREVER, scan_interval_us=period_us)
         for _ in range(TRIES):
@@ -280,7 +280,7 @@ class Radar:
             return self._early.popleft()
         message = self._hear(timeout)
         if isinstance(message, mrm.ReadyInfo):
-            raise Silent("has been started anew")
+            raise Silent("has been started again")
         return (message, self._clock.now()) if isinstance(message, ScanInfo) else None
 
     def _falls_still(self) -> bool:
@@ -336,7 +336,7 @@ class Framing:
         return None if self._fit.period is None else self._fit.period / TICKS_PER_SECOND
 
     def restart(self) -> None:
-        """Forget the radar's clock: it was started anew."""
+        """Forget the radar's clock: it was started again."""
         self._held.clear()
         self._fit.restart()
 

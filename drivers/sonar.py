@@ -30,7 +30,7 @@ from caneflow.runtime.node import run
 log = logging.getLogger(__name__)
 
 RETRY = 0.25  # s between two looks for a sensor that is gone
-SILENCE = 0.5  # s without a word on a serial line, after which it is opened anew
+SILENCE = 0.5  # s without a word on a serial line, after which it is opened again
 SERIAL_READING = 0.05  # s of one measurement of an MB10xx
 SERIAL_DELAY = 0.04  # s from the ping to the end of the word: 37.5 ms of listening and 4 ms of sending (PD11832)
 MB1010_FARTHEST = 6.45  # m, 254 inches: what it says when nothing answers
@@ -91,7 +91,7 @@ class Sonar(Source):
                     heard = time.monotonic()
                     yield from self._reading(distance, delay=SERIAL_DELAY)
                 if time.monotonic() - heard > SILENCE:
-                    raise ProtocolError(f"no word for {SILENCE} s; {words.garbled} bytes were no words")
+                    raise ProtocolError(f"no word for {SILENCE} s; {words.garbled} bytes were not words")
 
     def _reading(self, distance: float, *, delay: float) -> Brought:
         stamp = time.time_ns()

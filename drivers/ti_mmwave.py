@@ -28,7 +28,7 @@ from caneflow.runtime.node import run
 log = logging.getLogger(__name__)
 
 ANSWER_TIME = 2.0  # s for one line; sensorStart takes longest
-SILENCE = 1.0  # s without a frame, and at least SILENT_FRAMES of them, after which the radar is set up anew
+SILENCE = 1.0  # s without a frame, and at least SILENT_FRAMES of them, after which the radar is set up again
 SILENT_FRAMES = 5
 SAYING = 0.25  # s after which the driver says that nothing comes
 RETRY = 0.25  # s
@@ -78,7 +78,7 @@ class TiMmwave(Source):
         self._next_loss_line = 0.0  # s
 
     def samples(self) -> Brought:
-        """Yield points; a radar that falls silent is set up anew, one that never answered is an error."""
+        """Yield points; a radar that falls silent is set up again, one that never answered is an error."""
         give_up = time.monotonic() + self._settings.start_timeout_s
         try:
             while True:

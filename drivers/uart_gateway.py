@@ -98,11 +98,11 @@ class Microcontroller:
 
     @property
     def bad_frames(self) -> int:
-        """Stretches of bytes from the microcontroller that were no frame."""
+        """Stretches of bytes from the microcontroller that were not frames."""
         return self._deframer.bad
 
     def begin(self, session: int) -> Status:
-        """Let the observer begin anew; raises DataflowError when nothing answers within `start_timeout_s`."""
+        """Let the observer begin again; raises DataflowError when nothing answers within `start_timeout_s`."""
         self._session, self._number = session, 0
         self._unanswered.clear()
         now = self._now()

@@ -1,4 +1,4 @@
-"""A message of one's own: how far somebody has walked. Import it from here: one file defines a schema."""
+"""A message of one's own: how far someone has walked. Import it from here: one file defines a schema."""
 
 from typing import Annotated
 

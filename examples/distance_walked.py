@@ -22,7 +22,7 @@ class DistanceWalked(Operator):
         self._last: GroundSpeed | None = None
 
     def handle(self, port: str, message: Sample) -> Emitted:
-        """Yield the distance so far. What is not valid is no speed of zero: it is time that nobody saw."""
+        """Yield the distance so far. What is not valid is not a speed of zero: it is time that nobody saw."""
         assert isinstance(message, GroundSpeed)
         last, self._last = self._last, message
         if last is not None:

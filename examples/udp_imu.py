@@ -45,7 +45,7 @@ def sample(datagram: bytes, stamp: int) -> Imu | None:
         reading = msgspec.json.decode(datagram, type=Reading)
         return Imu(stamp=stamp, gyro=reading.gyro, accel=reading.accel)
     except ValueError as error:  # of the JSON, or beyond what any IMU measures
-        log.warning("a datagram of %d bytes is no reading: %s", len(datagram), error)
+        log.warning("a datagram of %d bytes is not a reading: %s", len(datagram), error)
         return None
 
 

@@ -24,7 +24,7 @@ struct frame {
 struct deframer {
     uint8_t coded[LONGEST_CODED];
     size_t size;
-    bool too_long; /* what has come since the last 00 is no frame */
+    bool too_long; /* what has come since the last 00 is not a frame */
     uint32_t bad;  /* stretches between two 00 that were none */
 };
 

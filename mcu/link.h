@@ -8,7 +8,7 @@
 #define LINK_VERSION 1
 
 /* From the host. */
-#define RESET 'R'        /* session: begin anew; answered by a status */
+#define RESET 'R'        /* session: begin again; answered by a status */
 #define ASK 'Q'          /* answered by a status */
 #define IMU 'I'          /* Imu; answered by a pose or a refusal */
 #define GROUND_SPEED 'G' /* GroundSpeed; not answered */

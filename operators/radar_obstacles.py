@@ -4,7 +4,7 @@ in   frame   : RadarFrame    one scan per 10 ms
 in   pose    : Pose          of the cane: how fast the antenna moves, and how high it is
 out  targets : RadarTargets  every tenth scan; without arrays where there is nothing
 
-Neither a side nor a height can be told, so a target stands in no map. It is no mobility aid: research software only.
+Neither a side nor a height can be told, so a target stands in no map. It is not a mobility aid: research software only.
 """
 
 import math

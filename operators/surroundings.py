@@ -7,7 +7,7 @@ out  grid     : Grid       2 Hz
 out  obstacles: Obstacles  at each reading of the sensor that looks highest
 out  cue      : Cue        with each Obstacles, and every 0.1 s when no reading comes
 
-It is no mobility aid. caneflow is research software, no medical device, it does not replace the cane, and nobody may
+It is not a mobility aid. caneflow is research software, no medical device, it does not replace the cane, and nobody may
 rely on it to walk.
 """
 

@@ -17,7 +17,7 @@ for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 # A run that nobody changed must not turn red: what only another draw finds is found where it is looked for, and a busy
-# machine is no fault of the test.
+# machine is not a fault of the test.
 loaded = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("same", loaded, derandomize=True)
 settings.register_profile("others", loaded, derandomize=False)

@@ -219,7 +219,7 @@ def test_without_magnetometer_the_bias_about_the_vertical_stays_unknown() -> Non
 
 
 def test_a_hand_that_sways_at_rest_is_no_bias() -> None:
-    """Half a degree per second at 0.4 Hz, for two seconds: the gyro's own deviations tell that it is no table."""
+    """Half a degree per second at 0.4 Hz, for two seconds: the gyro's own deviations tell that it is not a table."""
     attitude = make()
 
     def hand(t: float) -> Quaternion:

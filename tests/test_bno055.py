@@ -120,7 +120,7 @@ def test_scales_are_the_data_sheets() -> None:
     assert (WHOLE.length, WITHOUT_ACCEL_AND_MAG.length) == (46, 34)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(
     vectors,
     vectors,
@@ -158,7 +158,7 @@ def test_values_beyond_the_registers_stay_at_their_ends() -> None:
     assert said.gyro == pytest.approx(((2**15 - 1) * GYRO_STEP, -(2**15) * GYRO_STEP, 0.0))
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.binary(max_size=60))
 def test_any_bytes_are_a_measurement_or_refused(data: bytes) -> None:
     for block in (WHOLE, WITHOUT_ACCEL_AND_MAG):
@@ -211,7 +211,7 @@ def test_24_ways_of_mounting_and_no_mirror() -> None:
             axes(text)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.binary(min_size=22, max_size=22))
 def test_a_profile_comes_back_as_it_was(data: bytes) -> None:
     assert CalibrationProfile.from_bytes(data).to_bytes() == data

@@ -183,7 +183,7 @@ def test_the_field_where_the_walk_began_shows_the_gyros_bias() -> None:
 
 
 def test_a_heading_that_cannot_be_known_shows_in_the_covariance() -> None:
-    """The field wanders by 15 deg and is no map: nothing holds a gyro of 0.3 deg/s."""
+    """The field wanders by 15 deg and is not a map: nothing holds a gyro of 0.3 deg/s."""
     wander = np.cumsum(np.random.default_rng(1).normal(0.0, 0.0035, len(loop(8.0).yaws)))
     walk = loop(8.0, gyro_bias=0.3 * DEGREE, north=wander)
     _, estimates = run(walk)
@@ -359,7 +359,7 @@ def test_a_radar_that_moves_sideways_is_believed_less() -> None:
 
 
 def test_the_local_pose_never_leaps_and_its_covariance_grows_as_the_way_does() -> None:
-    """When the field shows the gyro's bias, the track is laid anew; a map of the last seconds must not notice."""
+    """When the field shows the gyro's bias, the track is laid again; a map of the last seconds must not notice."""
     walk = loop(gyro_bias=0.3 * DEGREE, noise=0.05, alike=9 / 11)
     locals_: list[PoseEstimate] = []
     _, estimates = run(walk, watch=lambda cane: locals_.append(cane.local()))

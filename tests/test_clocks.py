@@ -84,7 +84,7 @@ def test_drift_is_found_through_a_radio_link(drift: float) -> None:
     now = START + 96 * SECOND
 
     assert estimate.drift == pytest.approx(drift, abs=15e-6)
-    assert estimate.offset_at(now) == pytest.approx(pair.truth(now), abs=1e-3)  # of delays of 28 ms in the mean
+    assert estimate.offset_at(now) == pytest.approx(pair.truth(now), abs=1e-3)  # of delays of 28 ms on average
 
 
 def test_the_least_delay_counts_and_not_the_mean() -> None:

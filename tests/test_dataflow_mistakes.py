@@ -154,7 +154,7 @@ ONE_MISTAKE = {
         "  im-u: {run: drivers.bno055}\n  imu: {",
         "3:3: nodes.im-u: not a valid name; expected a lower-case letter, then lower-case letters, digits or _",
     ),
-    "node that is no mapping": (
+    "node that is not a mapping": (
         "{run: drivers.bno055}",
         "drivers.bno055",
         "3:8: nodes.imu: is 'drivers.bno055'; it takes a mapping",

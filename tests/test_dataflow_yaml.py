@@ -109,7 +109,7 @@ nodes:
     assert said(tmp_path / "flow.yaml", text.encode()) == [
         "3:1: seed: is written twice, first in line 2; keep one",
         "4:20: rig.hand_height: is not a number; nothing can be set to that",
-        "4:36: rig.aperture: 'wide' is no float: could not convert string to float: 'wide'",
+        "4:36: rig.aperture: 'wide' is not of type float: could not convert string to float: 'wide'",
         "6:40: nodes.imu.settings: has the tag !python/object; only plain values are read",
         "7:3: nodes.7: not a key; expected text, in quotes if need be",
         "8:3: nodes.imu: is written twice, first in line 6; keep one",

@@ -103,7 +103,7 @@ def test_a_certificate_that_is_taken(tmp_path: Path) -> None:
     keys = keys_of(tmp_path / "keys")
     with tls_server(keys, trusted=keys) as where:
         findings = list(way_to(where, keys))
-    assert [finding.text for finding in findings] == ["somebody listens", "TLS, and it takes laptop.crt"]
+    assert [finding.text for finding in findings] == ["someone listens", "TLS, and it takes laptop.crt"]
 
 
 def test_a_certificate_of_another_authority_is_denied_and_by_whom_is_said(tmp_path: Path) -> None:
@@ -341,8 +341,8 @@ def test_the_way_to_a_socket(tmp_path: Path) -> None:
     (nobody,) = way_to(unix(path))
     assert (nobody.state, nobody.text) == ("bad", "no answer: No such file or directory")
     with open_session(listen=[unix(path)]):
-        (somebody,) = way_to(unix(path))
-    assert (somebody.state, somebody.text) == ("ok", "somebody listens")
+        (someone,) = way_to(unix(path))
+    assert (someone.state, someone.text) == ("ok", "someone listens")
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
     (left,) = way_to(unix(path))

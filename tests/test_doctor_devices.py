@@ -280,7 +280,7 @@ def module(path: object, **more: object) -> str:
 @pytest.mark.parametrize(
     ("name", "state", "said", "attempt"),
     [
-        ("noise", "ok", "dB in the mean", ""),
+        ("noise", "ok", "dB on average", ""),
         ("nothing", "look", "silent: not a bit changes", "is the module powered"),
         ("too loud", "look", "of the samples at its end", "less gain"),
     ],

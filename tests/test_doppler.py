@@ -128,7 +128,7 @@ def test_a_floor_that_falls_is_known_within_half_of_its_memory() -> None:
 
 
 def test_lamp_hum_is_part_of_the_floor() -> None:
-    """A line that never goes away is no person, though it is the strongest."""
+    """A line that never goes away is not a person, though it is the strongest."""
     random = np.random.default_rng(2)
     at = np.arange(round(30 * RATE)) / RATE
     hum = 0.003 * np.cos(2 * np.pi * 100.0 * at)
@@ -342,7 +342,7 @@ def amplifier(seconds: float, seed: int, rise: float, corner: float, *, signed: 
 
 
 def walker(samples: np.ndarray, speed: float, decibels: float, begin: float, end: float) -> np.ndarray:
-    """The samples with somebody at `speed` m/s between two times (s), so far above white noise of 1e-3 in a window."""
+    """The samples with someone at `speed` m/s between two times (s), so far above white noise of 1e-3 in a window."""
     at = np.arange(len(samples)) / RATE
     amplitude = math.sqrt(2.0 * 1.5 / 0.256 * 1e-6 / (RATE / 2.0) * 10.0 ** (0.1 * decibels))
     wave = amplitude * np.exp(2j * np.pi * 160.93 * speed * at) * ((at > begin) & (at < end))

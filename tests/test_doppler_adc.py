@@ -84,7 +84,7 @@ def test_frames_that_cannot_be_the_modules_are_refused(frames: NDArray[Any]) -> 
         ModuleChannels(first=1).output(frames)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.lists(st.integers(0, 40), max_size=20), st.integers(1, 30))
 def test_blocks_are_the_samples_however_they_came(lengths: list[int], length: int) -> None:
     samples = noise(sum(lengths))[:, 0]
@@ -244,7 +244,7 @@ def test_recorded_walks_of_others_are_imported(name: str, tmp_path: Path) -> Non
 
 
 class Hours:
-    """A clock that goes on only when somebody waits; in the place of the module `time`."""
+    """A clock that goes on only when someone waits; in the place of the module `time`."""
 
     def __init__(self) -> None:
         self.now = 100.0  # s
@@ -321,7 +321,7 @@ def test_a_flow_hears_the_same_from_a_file_and_from_its_recording(tmp_path: Path
 
 
 class Card:
-    """A card as `opened` shows it: pieces of its frames, on the clock that goes on only when somebody waits."""
+    """A card as `opened` shows it: pieces of its frames, on the clock that goes on only when someone waits."""
 
     def __init__(self, hours: Hours, pieces: list[driver.Piece | None]) -> None:
         self.hours = hours
@@ -589,4 +589,4 @@ def test_a_block_that_no_converter_makes_is_left_out_and_counted(
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(said) == 2
     assert said[0].startswith("a block is left out, as are others like it: samples has an element of 1e+30")
-    assert said[1].endswith("3 blocks left out: they hold what is no number, or no sound")
+    assert said[1].endswith("3 blocks left out: they hold what is not a number, or no sound")

@@ -187,6 +187,6 @@ def test_what_cannot_be_played_is_refused(walk: Path, tmp_path: Path) -> None:
     occupied.write_text("mine")
     assert "gave no orientation or no linear acceleration" in refused(raw)
     assert "no IMU belt/imu; there are imu/imu" in refused(walk, "--stream", "belt/imu")
-    assert "is no AT:FOR" in refused(walk, "--freeze", "3")
+    assert "is not an AT:FOR" in refused(walk, "--freeze", "3")
     assert "exists and is not an emulator's port" in refused(walk, "--port", occupied)
     assert occupied.read_text() == "mine"

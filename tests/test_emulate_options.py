@@ -38,7 +38,7 @@ def test_a_span() -> None:
 
 @pytest.mark.parametrize("text", ["", "3", "3:", ":3", "1:2:3", "-1:3", "1:0", "1:nan", "a:b"])
 def test_what_is_no_span(text: str) -> None:
-    with pytest.raises(typer.BadParameter, match="is no AT:FOR"):
+    with pytest.raises(typer.BadParameter, match="is not an AT:FOR"):
         emulate.span(text)
 
 

@@ -1,4 +1,4 @@
-"""A node that is somebody else's program: it dials the flow, feeds it, is counted, goes and comes back."""
+"""A node that is someone else's program: it dials the flow, feeds it, is counted, goes and comes back."""
 
 import json
 import shutil
@@ -90,7 +90,7 @@ def test_its_samples_reach_the_reader_and_the_recording_byte_for_byte(
         [external] = [node for node in status(session, flow).nodes if node.state == "external"]
         assert (external.node, external.pid, external.said) == ("imu", 0, "nothing was heard of it yet")
         publisher = session.declare_publisher(f"{flow}/imu/imu", encoding=encoding)
-        wait_for(lambda: publisher.matching_status, "somebody who reads it")
+        wait_for(lambda: publisher.matching_status, "someone who reads it")
         begin = time.time_ns()
         sent = [reading(seq, begin) for seq in range(50)]
         for payload in sent:
@@ -124,7 +124,7 @@ def test_it_is_counted_goes_and_comes_back(launch: Callable[..., Launched], tmp_
         session.put(key, reading(1105, begin))
         wait_for(lambda: edge(session) == (4, 2, 100), "what was sent to be counted")
     with client(at) as session:
-        for seq in range(3):  # started anew, it counts anew
+        for seq in range(3):  # started again, it counts again
             session.put(key, reading(seq, begin + 1200 * PERIOD_NS))
         wait_for(lambda: edge(session) == (7, 2, 100), "the new one to be taken up")
     assert running.said.count("refused: ") == 1, "each cause once"
@@ -158,7 +158,7 @@ def test_where_nobody_listens_check_warns_and_a_live_run_says_what_to_write(tmp_
     file.write_text(FLOW.format(flow="nobody"))
     checked = caneflow_here("check", file)
     assert checked.returncode == 0
-    assert "warning: nodes.imu: is a program of somebody else's, and this machine does not listen" in checked.stdout
+    assert "warning: nodes.imu: is a program of someone else's, and this machine does not listen" in checked.stdout
     run = caneflow_here("run", file)
     assert run.returncode == 2
     assert "or give --listen tcp/127.0.0.1:7447" in run.stderr.splitlines()[-1]

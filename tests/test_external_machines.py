@@ -1,4 +1,4 @@
-"""A program of somebody else's that feeds a flow on two machines, in the clear or with keys; what TLS lets it do."""
+"""A program of someone else's that feeds a flow on two machines, in the clear or with keys; what TLS lets it do."""
 
 import json
 import time
@@ -94,7 +94,7 @@ def are_handled(session: zenoh.Session, flow: str, count: int) -> bool:
 def fed(session: zenoh.Session, flow: str, begin: int) -> list[bytes]:
     """Put 50 samples, once the flow is there to read them."""
     publisher = session.declare_publisher(f"{flow}/imu/imu")
-    wait_for(lambda: publisher.matching_status, "somebody who reads it")
+    wait_for(lambda: publisher.matching_status, "someone who reads it")
     wait_for(lambda: len(statuses(session, flow)) == 2, "both machines")
     sent = [reading(seq, begin) for seq in range(50)]
     for payload in sent:

@@ -97,7 +97,7 @@ def test_random_kills_and_freezes_lose_nothing_and_leave_nothing(launch: Launch,
                 victim.resume()
                 done["frozen"] += 1
         except psutil.NoSuchProcess:
-            continue  # it was just being started anew
+            continue  # it was just being started again
     wait_for(lambda: len(node_processes(launched.process.pid)) == len(NODES) + 1, "all nodes to be back")
     launched.process.send_signal(signal.SIGINT)
     status = launched.ends()

@@ -306,7 +306,7 @@ def test_a_recording_is_played_whole_then_from_where_a_viewer_jumps_to(recording
         taken.clear()
         wait_for(lambda: playback.state().ended, "the end again")
         playback.control(playing=True, speed=FASTEST)
-        wait_for(lambda: len(taken) == 100, "all of it again: who plays at the end begins anew")
+        wait_for(lambda: len(taken) == 100, "all of it again: who plays at the end begins again")
     finally:
         playback.close()
         reader.join()

@@ -19,7 +19,9 @@ from operators.fusion import Fusion, FusionSettings, Method
 from operators.ground_speed import GroundSpeedOperator, GroundSpeedSettings
 from tests.test_operators_cane import samples_of
 
-METHODS: tuple[Method, ...] = tuple(each for each in get_args(Method) if each != "zero_velocity")  # a cane is no foot
+METHODS: tuple[Method, ...] = tuple(
+    each for each in get_args(Method) if each != "zero_velocity"
+)  # a cane is not a foot
 EACH_SECOND = tuple(range(250, 800, 100))
 BEGINNING = (0, 1)
 REST = (100, 101)  # the walk begins with 2 s of rest
@@ -190,7 +192,7 @@ def test_a_covariance_stays_as_it_is_while_readings_are_held() -> None:
 
 
 def test_what_lasts_is_believed() -> None:
-    """A chip that has found north anew turns all that follows: for `luenberger` the way as well."""
+    """A chip that has found north again turns all that follows: for `luenberger` the way as well."""
     north = spoilt(Imu, turned((0.0, 0.0, math.radians(40.0))), range(400, 2000))
     statuses = [pose.status for pose in poses("luenberger", north)]
     assert [index for index, status in enumerate(statuses) if status] == [400, 401, 402]

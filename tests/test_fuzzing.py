@@ -53,7 +53,7 @@ def for_all(examples: int, *strategies: st.SearchStrategy[Any]) -> Callable[[Cal
     """Run the function under it on so many draws of the strategies."""
 
     def run(holds: Callable[..., None]) -> None:
-        checks = list(HealthCheck)  # a busy machine is no failure
+        checks = list(HealthCheck)  # a busy machine is not a failure
         settings(max_examples=examples, deadline=None, suppress_health_check=checks)(given(*strategies)(holds))()
 
     return run

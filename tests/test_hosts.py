@@ -236,6 +236,8 @@ def test_in_one_process_a_fault_of_an_operator_names_its_node_and_sample(
 
 
 def test_a_recording_is_not_named_as_something_else(tmp_path: Path) -> None:
-    done = caneflow_here("run", "dataflow.yaml", "--replay", tmp_path / "walk.mcap", "--record", tmp_path / "out.txt")
+    done = caneflow_here(
+        "run", "dataflow.yaml", "--replay", tmp_path / "walk.mcap", "--in-process", "--record", tmp_path / "out.txt"
+    )
     assert done.returncode == 2
     assert done.stderr == f"caneflow run: --record: {tmp_path}/out.txt: a recording's name ends with .mcap\n"

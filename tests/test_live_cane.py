@@ -238,7 +238,7 @@ def _cpu_times(launcher: int) -> dict[str, float]:
     return times
 
 
-@pytest.mark.timeout(400)  # a busy machine is no failure
+@pytest.mark.timeout(400)  # a busy machine is not a failure
 @pytest.mark.parametrize("seconds", [9, pytest.param(60, marks=pytest.mark.long)])
 def test_live_gives_the_track_of_the_replay(
     seconds: int, desk: Callable[[int], Desk], tmp_path: Path, start: Callable[..., "subprocess.Popen[str]"]

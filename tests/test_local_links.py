@@ -163,7 +163,7 @@ def test_who_comes_by_the_door_reads_everything_and_may_ask(target: Target) -> N
 
 
 def forgeries(flow: str) -> dict[str, bytes]:
-    """By key what somebody would say to spoil the flow or to end it."""
+    """By key what someone would say to spoil the flow or to end it."""
     over = {node: encode(Counters(node=node, inputs={}, outputs={}, ended=True)) for node in ("ticker", "echo")}
     gone = {node: encode(Progress(node=node, handled=2**63 - 1, ports={})) for node in ("ticker", "echo")}
     return {

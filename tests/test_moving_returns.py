@@ -184,7 +184,7 @@ def test_a_wild_first_scan_is_forgotten_by_the_second(wild: str) -> None:
 
 @pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32, np.complex64])
 def test_a_radar_that_hangs_is_lost_until_it_goes_on(dtype: type) -> None:
-    """No receiver is without noise: the same scan a third time over is no measurement."""
+    """No receiver is without noise: the same scan a third time over is not a measurement."""
     scans: np.ndarray = ground(60).astype(dtype)
     scans[30:50] = scans[30]
     got = fed(scans, even(60))

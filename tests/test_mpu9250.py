@@ -92,7 +92,7 @@ def test_states_of_a_burst(head: str, status: int, works: bool, field: bool, was
     assert (said.magnetometer_works, said.mag is not None, said.was_reset) == (works, field, was_reset)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.binary(max_size=40))
 def test_any_bytes_are_a_measurement_or_refused(data: bytes) -> None:
     try:
@@ -103,7 +103,7 @@ def test_any_bytes_are_a_measurement_or_refused(data: bytes) -> None:
     Imu(stamp=1, gyro=said.gyro, accel=said.accel, mag=said.mag)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.binary(min_size=mpu9250.BURST, max_size=mpu9250.BURST))
 def test_bursts_come_back_as_they_were(data: bytes) -> None:
     said = measurement(data, SCALES)

@@ -147,7 +147,7 @@ def test_a_value_that_does_not_fit_is_refused_when_building() -> None:
 KNOWN_TYPES = [0x1001, 0x1101, 0x1002, 0x1102, 0x1003, 0x1103, 0xF001, 0xF101, 0xF201, 0xF202]
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.sampled_from([b"", *(code.to_bytes(2) for code in KNOWN_TYPES)]), st.binary(max_size=2000))
 def test_no_bytes_raise_anything_but_a_protocol_error(head: bytes, tail: bytes) -> None:
     try:
@@ -168,7 +168,7 @@ def test_the_checksum_is_crc16_xmodem() -> None:
     assert binascii.crc_hqx(b"123456789", 0) == 0x31C3
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(
     st.lists(st.binary(min_size=4, max_size=60), max_size=8),
     st.booleans(),
@@ -195,7 +195,7 @@ def test_frames_are_found_again_after_noise_and_damage() -> None:
     assert list(deframer.feed(good[10:])) == [mrm.build(OTHERS[3])], "the cut frame is completed"
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.lists(st.binary(max_size=400), max_size=10), st.booleans())
 def test_a_deframer_never_raises_and_holds_less_than_a_frame(chunks: list[bytes], crc: bool) -> None:
     deframer = SerialDeframer(crc=crc)

@@ -170,8 +170,8 @@ def test_scans_that_never_came_are_counted_by_number_and_clock() -> None:
     assert missing_scans([replace(each, message_id=2 * each.message_id) for each in every if each.message_id != 3]) == 1
     wrapped = [replace(each, message_id=(each.message_id + 2**16 - 9) % 2**16) for each in every]
     assert missing_scans(wrapped[:5] + wrapped[12:]) == 7
-    anew = every[:10] + [replace(each, message_id=each.message_id + 500) for each in every[10:]]
-    assert missing_scans(anew) == 0
+    again = every[:10] + [replace(each, message_id=each.message_id + 500) for each in every[10:]]
+    assert missing_scans(again) == 0
     later = every[:10] + [replace(each, timestamp_ms=each.timestamp_ms + 10**6) for each in every[10:]]
     assert missing_scans(later) == 0
     assert missing_scans(every[:1]) == missing_scans([]) == 0

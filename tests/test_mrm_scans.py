@@ -53,7 +53,7 @@ def same(a: Scan, b: Scan) -> bool:
     ) and np.array_equal(a.samples, b.samples)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.integers(0, 1200))
 def test_splitting_and_assembling_are_inverse(samples: int) -> None:
     whole = scan(3, samples=samples)
@@ -79,7 +79,7 @@ def test_reordered_and_repeated_packets_of_neighbouring_scans(boot_ms: int) -> N
     assert counts.duplicate_packets + counts.late_packets == len(packets)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.lists(st.integers(0, 59), max_size=30, unique=True), st.randoms(use_true_random=False))
 def test_a_scan_comes_out_exactly_if_all_its_packets_went_in(lost: list[int], rng: random.Random) -> None:
     sent = [scan(i) for i in range(20)]  # three packets each
@@ -150,7 +150,7 @@ def test_memory_stays_bounded_whatever_comes() -> None:
     assert max(held) <= 4
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.integers(0, 2**32 - 1), st.integers(-(2**31), 2**31 - 1))
 def test_the_clock_wraps(earlier: int, elapsed: int) -> None:
     assert milliseconds_after((earlier + elapsed) % 2**32, earlier) == elapsed
@@ -192,7 +192,7 @@ def test_what_is_no_log_is_named(data: bytes, says: str) -> None:
         parse_log(data)
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.binary(max_size=3000))
 def test_no_log_raises_anything_but_a_protocol_error(data: bytes) -> None:
     try:

@@ -410,7 +410,7 @@ MORE: dict[tuple[str, str], list[list[object]]] = {
     ("graph", "output"): [["graph", "YAML", "--format", form, "-o", "OUT"] for form in ("svg", "json")],
 }
 CALLS = [(named, call) for named, first in OUTPUTS.items() for call in (first, *MORE.get(named, []))]
-# What only reads, keeps to rules of its own (keys, the results that go on, a link to a terminal), or is no user's file.
+# What only reads, has rules of its own (keys, results that continue, a link to a terminal), or is not a user's file.
 OTHERS = {
     *(("run", name) for name in ("replay", "keys", "rig")),
     *((word, "keys") for word in ("status", "hz", "echo", "top", "record", "doctor", "view", "ros2", "foxglove")),
@@ -461,7 +461,7 @@ def test_overwrite_is_where_an_output_is_and_nowhere_else() -> None:
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    """What a call may name; OUT exists and is no picture, no recording."""
+    """What a call may name; OUT exists and is not a picture, no recording."""
     paths = {name: tmp_path / name.lower() for name in ("REC", "YAML", "LOG")}
     paths["OUT"] = tmp_path / "out.py"
     with RecordingWriter(paths["REC"], flow="cane", source="live", rig={}) as writer:

@@ -43,7 +43,7 @@ class Ended(BaseException):
 
 
 class World(Clock):
-    """A clock that goes on only when somebody waits."""
+    """A clock that goes on only when someone waits."""
 
     def __init__(self) -> None:
         self.time = round(BOOTED * SECOND)  # ns
@@ -268,7 +268,7 @@ def test_a_radar_slower_than_asked_is_found_out(caplog: pytest.LogCaptureFixture
     scans = [scan(number, period_ms=17.28) for number in range(200)]
     desk = Desk(moments(scans, 0.01728)).run()
     assert [f.scan_period for f in desk.frames[-100:]] == pytest.approx([0.01728] * 100, rel=5e-3)
-    assert len({f.scan_period for f in desk.frames}) == 2, "what depends on the period begins anew once"
+    assert len({f.scan_period for f in desk.frames}) == 2, "what depends on the period begins again once"
     assert "scans every 17.2" in caplog.text
     assert "asked for every 10 ms" in caplog.text
     assert "lost" not in caplog.text
@@ -496,7 +496,7 @@ HOSTILE = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=60)  # a busy machine is no failure
+@settings(deadline=None, max_examples=60)  # a busy machine is not a failure
 @given(HOSTILE)
 def test_no_bytes_upset_the_driver(said: list[bytes]) -> None:
     world = World()

@@ -196,7 +196,7 @@ def test_without_power_it_is_silent_and_then_it_has_booted() -> None:
     assert [(p.message_id, p.timestamp_ms) for p in packets] == [(51, 9), (51, 9), (52, 19), (52, 19)]
 
 
-@settings(deadline=None)  # a busy machine is no failure
+@settings(deadline=None)  # a busy machine is not a failure
 @given(st.lists(st.binary(max_size=60), max_size=20), st.sampled_from([b"", b"\x10\x01", b"\x10\x03", b"\xf0\x05"]))
 def test_no_request_upsets_it(requests: list[bytes], head: bytes) -> None:
     radar = emulator(10)

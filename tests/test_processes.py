@@ -234,7 +234,7 @@ def test_a_replay_keeps_the_recorded_spacing(cane: Path, walk: Path, tmp_path: P
         }
         first = next(recording.samples([("imu", "imu")]))
     assert first.stamp == 2_000_000_000
-    assert first.seq == 0  # a run counts anew
+    assert first.seq == 0  # a run counts again
     for stream, of_stream in times.items():
         assert len(of_stream) == 200, stream
         # A busy machine holds some samples up, never all of them: those that came soonest tell the pace.
@@ -443,7 +443,7 @@ def test_a_killed_recorder_or_a_lost_folder_ends_no_live_flow(
     folder.rename(tmp_path / "elsewhere")
     wait_for(lambda: "recorder" not in node_processes(running.process.pid), "the end of a recorder without a folder")
     folder.mkdir()
-    (folder / "out_001.mcap").write_text("of somebody else")
+    (folder / "out_001.mcap").write_text("of someone else")
     wait_for(lambda: last.exists() and last.stat().st_size > 10_000, "the third part")
     assert (running.node("echo").pid, running.node("ticker").pid) == (echo.pid, ticker.pid)
     status, output = running.end(signal.SIGINT)
@@ -451,7 +451,7 @@ def test_a_killed_recorder_or_a_lost_folder_ends_no_live_flow(
     assert "incomplete" not in output, "it records at the end"
     assert output.count("THE FLOW GOES ON WITHOUT ITS RECORDING") == 2
     assert output.count("recorder | is there again, after") == 2
-    assert again.read_text() == "of somebody else"
+    assert again.read_text() == "of someone else"
 
     seqs, runs = list[int](), set[str]()
     for number, part in enumerate((tmp_path / "elsewhere/out.mcap", tmp_path / "elsewhere/out_001.mcap", last)):

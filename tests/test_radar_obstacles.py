@@ -1,4 +1,4 @@
-"""What a radar that moves sees besides the floor: a post ahead, nobody, somebody who walks away."""
+"""What a radar that moves sees besides the floor: a post ahead, nobody, someone who walks away."""
 
 from collections.abc import Callable
 

@@ -173,7 +173,7 @@ def test_zero_velocity_closes_the_loop(steps: list[Reading]) -> None:
 
 @pytest.mark.long
 def test_the_loop_closes_with_other_thresholds_too(steps: list[Reading]) -> None:
-    """Half as much again: 0.26 m, so that the default is no lucky choice."""
+    """Half as much again: 0.26 m, so that the default is not a lucky choice."""
     stance = StanceSettings(accel=1.5 * 1.7, gyro=math.radians(1.5 * 17.0))
     error, _ = end_error(ZeroVelocitySettings(stance=stance), steps)
     assert error < 0.4

@@ -195,7 +195,7 @@ def test_what_recover_writes_is_read_whatever_the_cut(tmp_path: Path, sound: tup
         try:
             found = recover(path, target)
         except RecordingError as error:
-            assert isinstance(error, NothingLeftError) or cut < 8, "or it is no MCAP file yet"
+            assert isinstance(error, NothingLeftError) or cut < 8, "or it is not an MCAP file yet"
             assert "nothing to recover" in str(error) or cut < 8
             assert not target.exists()
             assert not kept, "what is longer has more"

@@ -1,4 +1,4 @@
-"""A recording in parts: by size, by time, and the last seconds when somebody asks."""
+"""A recording in parts: by size, by time, and the last seconds when someone asks."""
 
 import errno
 import itertools
@@ -126,7 +126,7 @@ def test_a_file_that_lost_its_name_is_not_written_on(tmp_path: Path, loss: str) 
     else:
         (folder / "walk.mcap").unlink()
     if loss == "replaced":
-        (folder / "walk.mcap").write_bytes(b"of somebody else")
+        (folder / "walk.mcap").write_bytes(b"of someone else")
     with pytest.raises(RecordingError, match="was removed or moved while it was written"):
         feed(recording, range(50, 200))  # within the next second
 
@@ -299,5 +299,5 @@ def test_info_knows_when_numbers_began_anew(caneflow: Callable[..., Run], tmp_pa
             stamp = START + place * STEP
             payload = numbered(Imu(stamp=stamp, gyro=(0.0, 0.0, 0.0)), seq)
             writer.write(KEY, Imu, payload, stamp=stamp, seq=seq, log_time=stamp)
-    assert "numbers began anew; --full counts" in caneflow("info", path)[1]
-    assert "0, numbers began anew 1 x" in caneflow("info", path, "--full")[1]
+    assert "numbers began again; --full counts" in caneflow("info", path)[1]
+    assert "0, numbers began again 1 x" in caneflow("info", path, "--full")[1]

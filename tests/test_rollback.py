@@ -20,12 +20,12 @@ from caneflow.runtime.stages.operator_stage import Stage
 from caneflow.runtime.stages.snapshot import pack
 from caneflow.runtime.stages.snapshot_keeper import SnapshotKeeper
 
-GOOD, REFUSED, FAILS = 1.0, -1.0, 800.0  # of the gyro's x: exp(800) is no number
+GOOD, REFUSED, FAILS = 1.0, -1.0, 800.0  # of the gyro's x: exp(800) is not a number
 SINGULAR, BUG, NUMPY, WRONG_OUTPUT, LATE, VALUE_ERROR = 801.0, 802.0, 803.0, 804.0, 805.0, 806.0
 
 
 class Careless(Operator):
-    """Changes its state, and only then finds out whether it can handle the sample; somebody else's operator."""
+    """Changes its state, and only then finds out whether it can handle the sample; someone else's operator."""
 
     inputs = {"imu": Imu}
     outputs = {"speed": GroundSpeed}
@@ -97,7 +97,7 @@ def state(host: Stage) -> bytes:
         (FAILS, "it makes the arithmetic fail: math range error"),
         (NUMPY, "it makes the arithmetic fail: overflow encountered in multiply"),
         (SINGULAR, "it makes the arithmetic fail: Singular matrix"),
-        (WRONG_OUTPUT, "what follows from it is no sample: speed is 1e+30; expected -100 to 100 m/s"),
+        (WRONG_OUTPUT, "what follows from it is not a sample: speed is 1e+30; expected -100 to 100 m/s"),
         (LATE, "it makes the arithmetic fail: math range error"),
     ],
 )
@@ -185,7 +185,7 @@ def test_an_operator_whose_state_cannot_be_kept_goes_on_and_says_so(
 
 
 class Poisoned(Careless):
-    """Python's own products overflow without a word: what follows from every sample after that is no sample."""
+    """Python's own products overflow without a word: what follows from every sample after that is not a sample."""
 
     def handle(self, port: str, message: Sample) -> Emitted:
         assert isinstance(message, Imu)

@@ -50,7 +50,7 @@ def circle(at: float) -> tuple[float, float, float]:
 
 
 def echo_at(sensor: StaticSensor, at: float, stamp_ns: int, random: np.random.Generator, signed: bool) -> Echo:
-    """What a sensor sees of somebody on the circle: 3 dB of fading, 0.08 m/s of gait."""
+    """What a sensor sees of someone on the circle: 3 dB of fading, 0.08 m/s of gait."""
     x, y, heading = circle(at)
     dx, dy = x - sensor.position[0], y - sensor.position[1]
     distance = math.hypot(dx, dy)
@@ -76,7 +76,7 @@ def walk(
     seed: int = 0,
     silent: Mapping[str, tuple[float, float]] | None = None,
 ) -> np.ndarray:
-    """Errors in m, by hop, of somebody who walks the circle; `silent`: sensors that say nothing from, to (s)."""
+    """Errors in m, by hop, of someone who walks the circle; `silent`: sensors that say nothing from, to (s)."""
     random = np.random.default_rng(seed)
     errors = []
     for hop in range(round(seconds / 0.05)):
@@ -362,7 +362,7 @@ def test_an_echo_that_reaches_far_back_does_not_silence_the_others() -> None:
 
 
 def test_a_leap_of_the_frame_is_no_way() -> None:
-    """As when dead reckoning lays its track anew: the way goes on from there."""
+    """As when dead reckoning lays its track again: the way goes on from there."""
     way = WayHistory()
     for k in range(100):
         leapt = 1e5 if 40 <= k < 70 else 0.0

@@ -104,7 +104,7 @@ def router() -> Iterator[str]:
 
 
 class Listener:
-    """Somebody in ROS's network who hears everything of domain 7."""
+    """Someone in ROS's network who hears everything of domain 7."""
 
     def __init__(self, endpoint: str) -> None:
         self.session = open_session(mode="peer", connect=[endpoint])
@@ -179,7 +179,7 @@ def test_what_nobody_hears_is_not_even_decoded(
     with Ros2Bridge(Ros2Settings(router=router, domain=7), "cane", Rig(), {"fusion/pose": Pose}, waits=True) as bridge:
         assert not take(0)
         listener.listen("/fusion/pose")
-        wait_for(lambda: take(1), "somebody listens")
+        wait_for(lambda: take(1), "someone listens")
         assert set(decoded) == {1}
 
 

@@ -47,7 +47,7 @@ def test_yaw_turns_counter_clockwise_and_depression_is_positive_down() -> None:
 
 
 def test_no_rotation_is_refused() -> None:
-    with pytest.raises(ValueError, match="norm 0 is no rotation"):
+    with pytest.raises(ValueError, match="norm 0 is not a rotation"):
         rotations.normalized((0.0, 0.0, 0.0, 0.0))
 
 

@@ -93,7 +93,7 @@ def test_a_long_name_of_a_flow_does_not_make_the_folders_name_long(common: Path)
 
 
 def squatted(folder: Path, how: str) -> Path:
-    """Somebody was first at `folder`; where whatever is written into it would come."""
+    """Someone was first at `folder`; where whatever is written into it would come."""
     trap = folder.parent / "trap"
     trap.mkdir()
     if how == "link":

@@ -1,4 +1,4 @@
-"""Somebody with a cane in a room: both sensor sets have one walk, and the truth is the person's."""
+"""Someone with a cane in a room: both sensor sets have one walk, and the truth is the person's."""
 
 from dataclasses import replace
 from functools import cache

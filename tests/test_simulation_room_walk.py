@@ -118,14 +118,14 @@ def test_the_trunks_cross_section_is_its_mean_over_the_aspects() -> None:
     who = person(settings, default_rng(3))
     around = standing(np.array([0.0, 0.0]), 0.0, 20.0)
     turning = around._replace(heading=np.linspace(0.0, 2.0 * np.pi, len(around.time)))
-    somebody = body(gait(turning, who, settings, default_rng(0)), who, settings)
-    seen = seen_from(somebody, np.array([6.0, 0.0, 1.2]), settings, default_rng(1))
+    someone = body(gait(turning, who, settings, default_rng(0)), who, settings)
+    seen = seen_from(someone, np.array([6.0, 0.0, 1.2]), settings, default_rng(1))
     trunk = np.sum(seen.amplitudes[:11] ** 2, axis=0)
     assert trunk.mean() == pytest.approx(0.6, rel=0.05)
     chest, side = trunk[0], trunk[len(trunk) // 4]
     assert 10.0 * np.log10(chest / side) == pytest.approx(3.0, abs=0.8)
     # the specular point lies on the skin towards the sensor: half a depth or half a breadth away from the axis
-    reach = seen.points[0, :, 0] - somebody.axis[:, 0]
+    reach = seen.points[0, :, 0] - someone.axis[:, 0]
     assert reach.min() == pytest.approx(0.11, abs=0.005)
     assert reach.max() == pytest.approx(0.17, abs=0.005)
 
@@ -133,10 +133,10 @@ def test_the_trunks_cross_section_is_its_mean_over_the_aspects() -> None:
 def test_the_cross_section_fluctuates_slowly_by_a_decibel_and_a_half() -> None:
     way = standing(np.array([3.0, 4.0]), 0.3, 400.0)
     who = person(PLAIN, default_rng(1))
-    somebody = body(walker(way), who, PLAIN)
+    someone = body(walker(way), who, PLAIN)
     logs = []
     for seed in range(6):
-        seen = seen_from(somebody, np.array([0.0, 0.0, 1.2]), PLAIN, default_rng(seed))
+        seen = seen_from(someone, np.array([0.0, 0.0, 1.2]), PLAIN, default_rng(seed))
         logs.append(20.0 * np.log10(seen.amplitudes[0]))
     level = np.array(logs)
     level -= 20.0 * np.log10(np.sqrt(0.6 * 0.6 * (1.0 + 0.33 * np.cos(2.0 * (np.arctan2(-4.0, -3.0) - 0.3)))))

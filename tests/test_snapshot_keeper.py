@@ -224,7 +224,7 @@ def test_what_is_no_file_is_no_snapshot(make: Make, folder: Path, caplog: pytest
     assert not make().recovery["adder"].resume()
     (folder / "adder.snapshot").unlink()
     os.mkfifo(folder / "adder.snapshot")
-    assert not make().recovery["adder"].resume(), "nobody waits for somebody to write"
+    assert not make().recovery["adder"].resume(), "nobody waits for someone to write"
     (folder / "adder.snapshot").unlink()
     (folder / "adder.snapshot").mkdir()
     host = make()

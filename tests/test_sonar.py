@@ -26,7 +26,7 @@ ECHOES = Echoes([0.0, 1.0, 2.0], [1.23, 2.5, None])
 
 
 class Bench:
-    """A clock that goes on only when somebody waits."""
+    """A clock that goes on only when someone waits."""
 
     def __init__(self, chip: I2cSonar, time: float = 0.0) -> None:
         self.chip, self.time = chip, time

@@ -35,7 +35,7 @@ results: []
 
 
 def cues(seconds: float) -> Iterator[Cue]:
-    """Somebody comes nearer, a stair, nothing, a sensor that is gone."""
+    """Someone comes nearer, a stair, nothing, a sensor that is gone."""
     for seq in range(round(seconds * 15)):
         stamp, at = SECOND + seq * SECOND // 15, seq / 15
         if at % 6 < 3:

@@ -145,7 +145,7 @@ def pocketed(*, strides: int, stride: float, bobs: int, seed: int = 1) -> StepHe
     for k in range(count):
         t = max(k * PERIOD - 2.0, 0.0)
         phase = t / stride % 1.0
-        forward, back = math.radians(200.0), math.radians(35.0)  # rad/s; the slow way back is no swing
+        forward, back = math.radians(200.0), math.radians(35.0)  # rad/s; the slow way back is not a swing
         rate = forward * math.sin(2.0 * math.pi * phase) if phase < 0.5 else -back * math.sin(2.0 * math.pi * phase)
         force = 9.80665 + (2.0 * math.sin(2.0 * math.pi * bobs * t / stride) + impacts[k] if t > 0.0 else 0.0)
         shs.imu(

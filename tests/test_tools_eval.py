@@ -167,7 +167,7 @@ def test_the_csv_holds_what_the_json_holds(answer: tuple[dict[str, Any], Path]) 
 
 def test_a_bad_recording_does_not_stop_the_others(walks: list[Path], tmp_path: Path) -> None:
     bad = tmp_path / "bad.mcap"
-    bad.write_text("this is no recording\n")
+    bad.write_text("this is not a recording\n")
     missing = tmp_path / "missing.mcap"
     done = caneflow("eval", bad, walks[0], missing, "--methods", "luenberger", "--json")
     assert done.returncode == 1

@@ -232,7 +232,7 @@ def test_lost_scans_are_said_in_the_last_line(caneflow: Callable[..., Run], tmp_
     log.write_bytes(b"".join(packets[:20] + packets[26:50] + packets[51:]))  # scans 10 to 12, and a packet of 25
     status, out, _ = caneflow("import", "p440", log, "-o", path)
     last = "56 scans of 400 samples, 100.00 Hz, 1 incomplete ones left out, 3 never came by their numbers"
-    assert (status, out.splitlines()[-1]) == (0, f"{path}: {last}"), "what never came is no fault of the log"
+    assert (status, out.splitlines()[-1]) == (0, f"{path}: {last}"), "what never came is not a fault of the log"
     packets[30] = b"#" * SCAN_INFO_BYTES
     log.write_bytes(b"".join(packets))
     status, out, _ = caneflow("import", "p440", log, "-o", path, "--overwrite")

@@ -1,4 +1,4 @@
-"""status, hz, echo and top on flows that really run: started by somebody else, watched over Zenoh."""
+"""status, hz, echo and top on flows that really run: started by someone else, watched over Zenoh."""
 
 import json
 import os
@@ -183,7 +183,7 @@ def test_losses_are_counted_exactly_where_they_happen(flow: str) -> None:
         put(here, "gaps", range(14, 16))  # 9 to 13 never come
         put(here, "full", range(10))  # wait for `other`, of which nothing comes
         put(here, "prompt", range(3), first=2 * SECOND)
-        wait_for(lambda: edge_of(here.status(), "late.a").handled == 3, "the three that did not wait for ever")
+        wait_for(lambda: edge_of(here.status(), "late.a").handled == 3, "the three that did not wait forever")
         put(here, "tardy", range(6))  # all before the three
         expected = {
             "ticks.a": {},

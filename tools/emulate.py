@@ -63,7 +63,7 @@ def span(text: str) -> tuple[float, float]:
     except ValueError:
         at = lasts = math.nan
     if not (at >= 0.0 and lasts > 0.0):
-        raise typer.BadParameter(f"{text!r} is no AT:FOR, e.g. 10:3 for 3 s from second 10 on")
+        raise typer.BadParameter(f"{text!r} is not an AT:FOR, e.g. 10:3 for 3 s from second 10 on")
     return at, lasts
 
 
@@ -107,7 +107,7 @@ def bno055(
     silence: Annotated[Spans, _spans_in_which("it does not answer")] = None,
     unplug: Annotated[Spans, _spans_in_which("there is no port and no power")] = None,
     reset: Annotated[
-        list[float] | None, typer.Option(metavar="AT", help="At AT the chip starts anew by itself (likewise).")
+        list[float] | None, typer.Option(metavar="AT", help="At AT the chip starts again by itself (likewise).")
     ] = None,
     begin: Begin = None,
     seed: Seed = 1,
@@ -266,7 +266,7 @@ def p440(
     loss: Annotated[float, _part_of("the datagrams that get lost, both ways")] = 0.0,
     reorder: Annotated[float, _part_of("the scan packets that up to 3 others overtake")] = 0.0,
     duplicate: Annotated[float, _part_of("the scan packets that come twice")] = 0.0,
-    freeze: Annotated[Spans, _spans_in_which("or until it is started anew, no scans come")] = None,
+    freeze: Annotated[Spans, _spans_in_which("or until it is started again, no scans come")] = None,
     unplug: Annotated[Spans, _spans_in_which("it has no power; then it has booted")] = None,
     begin: Begin = None,
     seed: Seed = 1,

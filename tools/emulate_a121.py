@@ -166,7 +166,7 @@ def _share(text: str) -> float:
     except ValueError:
         value = -1.0
     if not 0.0 <= value <= 1.0:
-        raise typer.BadParameter(f"{text!r} is no part of a whole, e.g. 0.02 or 2%", param_hint="--loss")
+        raise typer.BadParameter(f"{text!r} is not part of a whole, e.g. 0.02 or 2%", param_hint="--loss")
     return value
 
 

@@ -41,7 +41,7 @@ def mmwave(
     """Make a recording of a TI mmWave radar's points: one sample per frame, positive Doppler approaching.
 
     Stamps are the frames' numbers times their period, 0 at the first: that of the configuration, or by the processor's
-    cycles (200 MHz; 600 on an xWR16). Frames that are missing are gaps. What is no packet is skipped and counted.
+    cycles (200 MHz; 600 on an xWR16). Frames that are missing are gaps. What is not a packet is skipped and counted.
 
     Example: caneflow import mmwave dump.bin -o walk.mcap --config profile.cfg
     """

@@ -93,7 +93,7 @@ def p440(
 def stamps_of(timestamps_ms: Sequence[int]) -> list[int]:
     """Stamps (ns, strictly increasing, from 0) of scans by the radar's clock, which shows whole milliseconds.
 
-    Scans of one millisecond share it evenly. When the clock begins anew, time goes on one millisecond later: how
+    Scans of one millisecond share it evenly. When the clock begins again, time goes on one millisecond later: how
     long the radar was off is not in the log.
     """
     stamps: list[int] = []

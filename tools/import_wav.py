@@ -52,7 +52,7 @@ def wav(
                 writer.write(stream, DopplerBlock, numbered(sample, seq), stamp=stamp, seq=seq, log_time=stamp)
                 seq, end = seq + 1, last + 1
     lacking = f"; {file.frames - end} of {file.frames} frames are not in the file" if end < file.frames else ""
-    refused = f"; {file.refused} blocks left out: they hold what is no number" if file.refused else ""
+    refused = f"; {file.refused} blocks left out: they hold what is not a number" if file.refused else ""
     if file.channels > 1 and quadrature is None:
         others = ", ".join(str(other) for other in range(file.channels) if other != channel)
         print(f"{sound}: channel {channel} of {file.channels}; --channel {others}, or --quadrature for I and Q")

@@ -137,11 +137,11 @@ def _lines(about: dict[str, Any]) -> Iterator[str]:
 
 def _loss(stream: dict[str, Any]) -> str:
     if stream["missing"] is None:
-        faults = ["-" if not stream["count"] else "numbers began anew; --full counts"]
+        faults = ["-" if not stream["count"] else "numbers began again; --full counts"]
     else:
         faults = [str(stream["missing"])]
     if stream["restarts"]:
-        faults.append(f"numbers began anew {stream['restarts']} x")
+        faults.append(f"numbers began again {stream['restarts']} x")
     if stream["stamps_back"]:
         faults.append(f"stamps do not increase {stream['stamps_back']} x")
     if stream["stamps_unlike"]:

@@ -151,8 +151,7 @@ class _Topic:
         self._outlet = neighbour.outlet(node.key(topic, kind, digest), kept=kept)
         neighbour.token(token)
         self._gid = gid_of(token)
-        self._kind = kind
-        self._types = types
+        self._encoded = types.encoder(kind)
         self._sent = 0
 
     @property
@@ -161,7 +160,7 @@ class _Topic:
 
     def send(self, message: Any) -> None:
         self._sent += 1
-        payload = self._types.encoded(self._kind, message)
+        payload = self._encoded(message)
         self._outlet.put(payload, attachment(self._sent, time.time_ns(), self._gid))
 
 

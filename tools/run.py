@@ -118,7 +118,7 @@ def command(
     processes = None if in_process else _processes(detach=detach)
     recorder = _recorder(record, rotate, keep, record_last, in_process=in_process)
     if record is not None:
-        record = named_at(_named_as_recording(record), datetime.now(UTC))
+        record = named_at(record, datetime.now(UTC))
     # The recording's name first, before any process; then the fork server: what is there now is there in every node.
     with (
         _kept(record, [file, replay, rig], overwrite=overwrite, parts=bool(recorder)),
@@ -130,6 +130,7 @@ def command(
                 print(warning, file=sys.stderr)
         if record is not None:
             require_no_input(record, [node.file for node in graph.nodes.values()])
+            _require_name_of_recording(record)
         speed = speed or ("max" if in_process else "1")
         played = _replay(replay, speed, start, duration, loop=loop, without=without or [])
         _check_machine(graph, machine, everything_here=in_process or played is not None)
@@ -153,10 +154,9 @@ def command(
         raise typer.Exit(outcome.status)
 
 
-def _named_as_recording(record: Path) -> Path:
+def _require_name_of_recording(record: Path) -> None:
     if record.suffix not in ("", RECORDING):  # a device has none
         raise DataflowError(f"--record: {record}: a recording's name ends with {RECORDING}")
-    return record
 
 
 def _processes(*, detach: bool) -> "AsProcesses":

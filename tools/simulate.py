@@ -324,7 +324,7 @@ def cane_in_room(
     ] = "nominal",
     overwrite: Overwrite = False,
 ) -> None:
-    """Simulate somebody with a white cane in a room of Doppler modules: both sensor sets, and where the person was.
+    """Simulate someone with a white cane in a room of Doppler modules: both sensor sets, and where the person was.
 
     The installation is that of `simulate room` with the same seed, whose empty room and walks calibrate it.
 

@@ -41,7 +41,7 @@ class Flow:
         """(stream, sample) as they come, of `streams` such as "fusion/pose" (none: of all); live, so never the past.
 
         Ends when nothing has come for `timeout` s; None: never. Of a program that is too slow the oldest samples are
-        dropped and counted, the flow goes on. Raises DataflowError for a name that is no stream's.
+        dropped and counted, the flow goes on. Raises DataflowError for a name that is not a stream's.
         """
         wanted = [_stream(each) for each in streams] or [(ANY, ANY)]
         waiting: queue.Queue[Heard] = queue.Queue()

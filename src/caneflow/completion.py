@@ -1,6 +1,6 @@
 """What a shell completes after a word of the command: names of flows, nodes, streams, machines, settings, methods.
 
-Quick, as somebody waits: names are read from the folders of runs, from dataflow files and from the sources of programs,
+Quick, as someone waits: names are read from the folders of runs, from dataflow files and from the sources of programs,
 of which none is imported. Paths the shell completes itself.
 """
 
@@ -18,7 +18,7 @@ Names: TypeAlias = Callable[[Sequence[str]], Iterable[str]]  # from what stands 
 
 LONGEST_NAMES = 1_000_000  # bytes of a file with names
 USUAL_FLOW = "dataflow.yaml"  # the usual file
-# Options without a value: what follows is no value of theirs.
+# Options without a value: what follows is not a value of theirs.
 FLAGS = frozenset(
     (
         *("--json", "--follow", "-f", "--open", "--ended", "--devices", "--endpoint", "--in-process", "--loop"),

@@ -42,7 +42,7 @@ def made_port(path: Path) -> Iterator[MadePort]:
     """A port at `path` as long as the context lasts; raises CaneflowError when something else has that name."""
     # What an emulator that was killed left behind is a link to a pseudo-terminal.
     if os.path.lexists(path) and not (path.is_symlink() and path.readlink().parent == TERMINALS):
-        raise CaneflowError(f"{path}: exists and is no emulator's port; choose another name")
+        raise CaneflowError(f"{path}: exists and is not an emulator's port; choose another name")
     mine, theirs = os.openpty()  # the other end stays open too: a driver that leaves must not take the terminal along
     try:
         tty.setraw(theirs)

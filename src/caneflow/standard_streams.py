@@ -30,7 +30,7 @@ class _Output(io.FileIO):
         self._end = False
 
     def write(self, data: Any, /) -> int:
-        """Write what somebody reads; raises SystemExit the first time that nobody does, if that is the end."""
+        """Write what someone reads; raises SystemExit the first time that nobody does, if that is the end."""
         try:
             return super().write(data)
         except OSError as error:

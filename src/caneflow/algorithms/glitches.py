@@ -29,7 +29,7 @@ class GlitchSettings:
     turn_rate: TurnRate = math.radians(120.0)  # rad/s
     field: Annotated[float, Ge(1e-3), Le(1e5)] = 60.0  # uT
     rotation: Angle = math.radians(10.0)  # rad, between two attitudes
-    most_held: Annotated[int, Ge(0), Le(1000)] = 3  # samples; what lasts longer is no glitch
+    most_held: Annotated[int, Ge(0), Le(1000)] = 3  # samples; what lasts longer is not a glitch
     longest_gap: Time = 0.05  # s; across a longer one a limit of `unseen` holds
     # times turn_rate, at the start and across a gap: 480 deg/s; nothing that a hand does to a cane goes beyond
     unseen: Annotated[float, Ge(1), Le(1000)] = 4.0

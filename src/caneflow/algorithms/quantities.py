@@ -2,7 +2,7 @@
 
 So a slip of the keyboard (1e300 for 1.0) is found by `caneflow check`, and nothing that passes it makes arithmetic
 overflow. The ends are far apart on purpose: they say what a quantity of this kind can be for a person with a cane in a
-room, not what works well. `X | Zero`: 0 turns it off; anything between 0 and the least value is no number but a slip.
+room, not what works well. `X | Zero`: 0 turns it off; between 0 and the least value it is a slip.
 """
 
 import math
@@ -25,7 +25,7 @@ Acceleration: TypeAlias = Annotated[float, Ge(1e-5), Le(4000)]  # m/s^2: 1 ug; 4
 MagneticField: TypeAlias = Annotated[float, Ge(-1e4), Le(1e4)]  # uT, with its sign: no compass reads more
 Offset: TypeAlias = Annotated[float, Ge(-1000), Le(1000)]  # m, with its sign: as Length
 # A noise density or a walk, in SI units per root Hz or root s: a millionth is below the best sensor of any kind here
-# (2e-6 rad/s/sqrt(Hz), 3e-5 m/s^2/sqrt(Hz)); a thousand is no knowledge at all.
+# (2e-6 rad/s/sqrt(Hz), 3e-5 m/s^2/sqrt(Hz)); a thousand is not knowledge at all.
 Density: TypeAlias = Annotated[float, Ge(1e-7), Le(1000)]
 Factor: TypeAlias = Annotated[float, Ge(1e-3), Le(1000)]  # a ratio, a number of standard deviations: no more than that
 Fraction: TypeAlias = Annotated[float, Ge(1e-6), Le(1)]  # of something, e.g. an error of its scale

@@ -49,7 +49,7 @@ def normalized(orientation: Quaternion) -> Quaternion:
     w, x, y, z = orientation
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if norm < 1e-9:
-        raise ValueError(f"a quaternion of norm {norm:.3g} is no rotation")
+        raise ValueError(f"a quaternion of norm {norm:.3g} is not a rotation")
     return w / norm, x / norm, y / norm, z / norm
 
 

@@ -130,11 +130,11 @@ class FoxgloveChannels:
         return foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=self._context)
 
     def _as_cdr(self, kind: str, make: Callable[[Any], Any]) -> Callable[[Any], bytes | None]:
-        types = self._ros.types
+        encoded = self._ros.types.encoder(kind)
 
         def encode(sample: Any) -> bytes | None:
             message = make(sample)
-            return None if message is None else types.encoded(kind, message)
+            return None if message is None else encoded(message)
 
         return encode
 
@@ -192,7 +192,7 @@ def _is_too_much(value: object) -> bool:
 
 
 def json_of(payload: bytes) -> bytes | None:
-    """The plain fields of a msgpack map as JSON; None: it is no map."""
+    """The plain fields of a msgpack map as JSON; None: it is not a map."""
     try:
         fields = msgspec.msgpack.decode(payload)
         plain = {name: value for name, value in fields.items() if not isinstance(value, msgspec.msgpack.Ext | bytes)}

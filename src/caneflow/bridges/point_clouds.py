@@ -42,7 +42,7 @@ def doppler_of(message: Any) -> Floats:
 
 
 def cloud_of(message: Any, stamp: int, bins: Bins, *, approaching: bool = False) -> RadarPoints:
-    """The points of a cloud in its own frame, x ahead; points that are no numbers are left out.
+    """The points of a cloud in its own frame, x ahead; points that are not numbers are left out.
 
     `approaching`: its Doppler is positive for what approaches. Raises ValueError for a cloud that does not add up.
     """

@@ -1,6 +1,6 @@
 """Our messages as ROS messages: which topics a stream fills, and what each holds. No other file names a ROS field.
 
-A stream has one `Picture` for each topic that it fills. A picture is made only when somebody wants it, so that what
+A stream has one `Picture` for each topic that it fills. A picture is made only when someone wants it, so that what
 nobody hears costs nothing.
 
 | stream | topic | message |

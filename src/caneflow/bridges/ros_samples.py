@@ -92,7 +92,7 @@ class FixedFrames:
         self._edges: dict[str, dict[str, Transform]] = {}
 
     def take(self, message: Any) -> None:
-        """Learn the transforms of a tf2_msgs/TFMessage; what is no rotation is left out."""
+        """Learn the transforms of a tf2_msgs/TFMessage; what is not a rotation is left out."""
         for each in message.transforms:
             rotation = _rotation(each.transform.rotation)
             if rotation is not None:
@@ -180,7 +180,7 @@ def _vector(vector: Any) -> Vector:
 
 
 def _rotation(quaternion: Any) -> Quaternion | None:
-    """Unit quaternion w x y z; None for what is no rotation, such as the zeros of a driver that knows none."""
+    """Unit quaternion w x y z; None for what is not a rotation, such as the zeros of a driver that knows none."""
     w, x, y, z = float(quaternion.w), float(quaternion.x), float(quaternion.y), float(quaternion.z)
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not abs(norm - 1) <= WORN:  # written so that NaN is none

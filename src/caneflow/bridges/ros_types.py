@@ -1,9 +1,11 @@
 """ROS message types by distribution, without ROS: classes, definitions, hashes, and CDR in and out, all by rosbags."""
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 from caneflow.bridges.errors import BridgeError
+from caneflow.bridges.repeated_cdr import RepeatedCdr
 from caneflow.errors import not_installed
 
 MISSING = not_installed("rosbags", "ros2")
@@ -32,6 +34,10 @@ class RosTypes:
     def encoded(self, kind: str, message: Any) -> bytes:
         """`message` as CDR, little-endian, with its header of four bytes."""
         return bytes(self._store.serialize_cdr(message, kind))
+
+    def encoder(self, kind: str) -> Callable[[Any], bytes]:
+        """The same for the messages of one topic, in a fraction of the time."""
+        return RepeatedCdr(self._store, kind, self.encoded)
 
     def decoded(self, kind: str, cdr: bytes) -> Any:
         """The message in `cdr`; raises BridgeError for bytes that hold none."""

@@ -22,7 +22,7 @@ PROBE_READS = 50
 MOST_OVERRUNS = 0.1  # part of the readings
 UART_ATTEMPTS = (
     "cross the wires: the chip's TX (its SDA pin) to RX of the host, its RX (SCL) to TX, ground to ground",
-    "select its UART: PS1 high, PS0 low, then power it anew",
+    "select its UART: PS1 high, PS0 low, then power it again",
     "no login shell on the port: sudo raspi-config, Interface Options, Serial Port",
     "on a Raspberry Pi 3 or later: dtoverlay=disable-bt in config.txt gives the pins the better UART",
 )
@@ -97,7 +97,7 @@ def _i2c_attempts(settings: Any) -> tuple[str, ...]:
         f"see who is on the bus: i2cdetect -y {settings.port.rpartition('-')[2]}; it may be address 0x{other:02X}",
         "a Raspberry Pi garbles what a chip says that stretches the clock, as this one does: "
         "dtoverlay=i2c-gpio in config.txt, then the bus that it makes; or use the UART",
-        "PS1 and PS0 low, then power it anew",
+        "PS1 and PS0 low, then power it again",
     )
 
 

@@ -11,7 +11,7 @@ from caneflow.runtime.hosts.attached.way_to import Finding
 
 NO_CARD = (
     "see what ALSA has: arecord -l; a card on USB has to be plugged in",
-    f"sudo usermod -aG audio {getpass.getuser()}, then log in anew: others may not use it",
+    f"sudo usermod -aG audio {getpass.getuser()}, then log in again: others may not use it",
 )
 
 

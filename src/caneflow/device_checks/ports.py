@@ -70,7 +70,7 @@ def _there(folder: str, *patterns: str) -> str:
 
 def _to_be_permitted(path: Path) -> tuple[str, ...]:
     group = path.group()
-    attempts = [f"sudo usermod -aG {group} {getpass.getuser()}, then log in anew"]
+    attempts = [f"sudo usermod -aG {group} {getpass.getuser()}, then log in again"]
     if group == "tty":  # a login shell has it
         attempts = [*_to_end_console(path), *attempts]
     return tuple(attempts)

@@ -194,7 +194,7 @@ def _channel(node: Node, name: str, values: NDArray[np.float64], silent: float) 
     if silent == 1.0 or float(np.std(values)) < QUIETEST:
         return Finding(node=node.name, state="look", text=f"{name} is silent: not a bit changes", attempts=wiring)
     rms, clipped = float(np.std(values)), float((np.abs(values) >= 1.0 - 2.0**-14).mean())
-    text = f"{name}: loudest {float(np.abs(values).max()):.3f} of full scale, {20 * math.log10(rms):.0f} dB in the mean"
+    text = f"{name}: loudest {float(np.abs(values).max()):.3f} of full scale, {20 * math.log10(rms):.0f} dB on average"
     attempts: tuple[str, ...] = ()
     if silent > SETTLING:
         text += f", silent in {100 * silent:.0f} % of the blocks"

@@ -1,6 +1,6 @@
 """What no sensor, person or flow can say: the bounds of every number in a message, each with its reason.
 
-A bound is no gate. It lies well beyond what the best sensor of its kind measures, so that no reading of a working
+A bound is not a gate. It lies well beyond what the best sensor of its kind measures, so that no reading of a working
 device breaks it, and far below where arithmetic overflows. A wild reading inside it is the estimators' business.
 """
 
@@ -34,7 +34,7 @@ POSITION = 4.1e7  # m: once round the earth is 4.0e7
 VELOCITY = 1000.0  # m/s of a pose: more than any vehicle; dead reckoning from an IMU alone drifts for hours until then
 COVARIANCE = 1e16  # m^2, m^2/s^2: the square of more than twice round the earth
 
-# Elements of radar scans that are no integers: integers of 32 bits are written as floats as well; twice their range.
+# Elements of radar scans that are not integers: integers of 32 bits are written as floats as well; twice their range.
 SCAN = 2.0**32
 SCAN_PERIOD = (1e-6, 60.0)  # s: pulses of a fast radar; one scan a minute follows nothing that moves
 RANGE_START = (-1e6, 1e6)  # m: as far as the numbers of a P440 go (32 bits of ps are 322 km), with margin
@@ -42,7 +42,7 @@ RANGE_STEP = (1e-5, 1000.0)  # m: far finer than any wavelength; far coarser tha
 CARRIER = (1e6, 1e12)  # Hz: radio; radars for people use 0.4 to 140 GHz
 BANDWIDTH = (1.0, 1e12)  # Hz: no wider than the carrier; 1 Hz is 150 000 km of resolution
 
-# Elements of sound that are no integers: full scale is 1, but some write the counts of 16 bits; three times those.
+# Elements of sound that are not integers: full scale is 1, but some write the counts of 16 bits; three times those.
 SOUND = 1e5
 AMPLITUDE = 1e6  # of a line in such sound, with margin for an I and a Q
 SAMPLE_RATE = (10.0, 1e6)  # Hz: no Doppler below; faster than any converter behind a Doppler module (sound: 384 kHz)
@@ -141,7 +141,7 @@ def require_covariance(name: str, covariance: tuple[float, float, float]) -> Non
     require_vector(name, covariance, SPEED_VARIANCE, "m^2/s^2")
     if xx < 0 or yy < 0:
         raise ValueError(f"{name} is {covariance}; variances are 0 or more")
-    if xy * xy > xx * yy * (1 + 1e-6):  # a little more than 1 by rounding is no correlation beyond 1
+    if xy * xy > xx * yy * (1 + 1e-6):  # a little more than 1 by rounding is not a correlation beyond 1
         raise ValueError(f"{name} is {covariance}; expected xy^2 to be at most xx times yy")
 
 

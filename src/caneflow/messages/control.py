@@ -121,7 +121,7 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     connect: tuple[str, ...] = ()  # whom it dials: its launcher, and the writers of its inputs
     held: int = 0  # bytes of samples that it keeps: sent and not confirmed, or waiting to be handled
     let_go: int = 0  # samples sent that can no longer be had again, though some reader has not confirmed them
-    asked: int = 0  # restarts that somebody asked for, not among the others
+    asked: int = 0  # restarts that someone asked for, not among the others
     settings: dict[str, Any] = {}  # that it was given; those that it was not have their defaults
 
 

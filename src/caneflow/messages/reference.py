@@ -22,7 +22,7 @@ def table(name: str) -> str:
 
 
 def with_tables(page: str) -> str:
-    """`page` with every table between `<!-- table NAME -->` and `<!-- end -->` written anew."""
+    """`page` with every table between `<!-- table NAME -->` and `<!-- end -->` written again."""
     return re.sub(
         r"<!-- table (\w+) -->\n.*?<!-- end -->",
         lambda found: f"<!-- table {found[1]} -->\n{table(found[1])}<!-- end -->",

@@ -72,7 +72,7 @@ class Lines:
         self._held = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Answer]:
-        """Yield what is whole; raises ProtocolError for what is no line of the protocol."""
+        """Yield what is whole; raises ProtocolError for what is not a line of the protocol."""
         self._held += data
         while (found := self._next()) is not None:
             yield found
@@ -86,9 +86,9 @@ class Lines:
         try:
             said = json.loads(bytes(self._held[:end]))
         except (ValueError, RecursionError) as error:
-            raise ProtocolError(f"a line that is no JSON: {bytes(self._held[:60])!r}") from error
+            raise ProtocolError(f"a line that is not JSON: {bytes(self._held[:60])!r}") from error
         if not isinstance(said, dict):
-            raise ProtocolError(f"a line that is no JSON object: {bytes(self._held[:60])!r}")
+            raise ProtocolError(f"a line that is not a JSON object: {bytes(self._held[:60])!r}")
         size = said.get("payload_size", 0)
         if not isinstance(size, int) or not 0 <= size <= LARGEST_PAYLOAD:
             raise ProtocolError(f"payload_size is {size!r}; a frame has 0 to {LARGEST_PAYLOAD} bytes")

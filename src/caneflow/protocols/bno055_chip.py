@@ -36,7 +36,7 @@ class Setup:
     mode: Mode = Mode.NDOF
     axes: Axes = field(default_factory=Axes)
     external_crystal: bool = True
-    profile: CalibrationProfile | None = None  # None: the chip begins anew
+    profile: CalibrationProfile | None = None  # None: the chip begins again
 
 
 class Identity(NamedTuple):
@@ -107,7 +107,7 @@ class Chip:
         return Reading(stamp, data[: bno055.VALUES_END], bno055.measurement(block, data))
 
     def set_up(self, setup: Setup) -> None:
-        """Make the chip work as wanted, from whatever state; its fusion begins anew."""
+        """Make the chip work as wanted, from whatever state; its fusion begins again."""
         self._choose_page()
         if setup.profile is not None and not self._is_fresh():
             self.reset()  # a fusion that has run does not take a profile (Bosch's moderator)

@@ -74,7 +74,7 @@ class Faults:
     short: float = 0.0  # part of all answers that end before their last bytes
     freezes: tuple[Span, ...] = ()  # the values stand still, unless there is a reset
     silences: tuple[Span, ...] = ()  # no answer
-    resets: tuple[float, ...] = ()  # the chip starts anew by itself
+    resets: tuple[float, ...] = ()  # the chip starts again by itself
     glitches: float = 0.0  # part of all readings in which a value is at the end of its register, or all are the same
     page: int = 0  # of the registers, that another program left chosen
 
@@ -116,7 +116,7 @@ class Emulator:
         self._page = self._pages[0][Register.PAGE_ID] = self._pages[1][Register.PAGE_ID] = faults.page
 
     def power_on(self, now: float) -> None:
-        """Begin anew after a loss of power; the motion goes on."""
+        """Begin again after a loss of power; the motion goes on."""
         self._start(now, bno055.START_UP)
 
     def ended(self, now: float) -> bool:
@@ -333,7 +333,7 @@ class Emulator:
 
 
 class Bench:
-    """A serial port with an emulated chip behind it, on a clock that goes on only when somebody waits.
+    """A serial port with an emulated chip behind it, on a clock that goes on only when someone waits.
 
     A BytePort: 60 s at 100 Hz pass as fast as they are computed, and the same way every time.
     """

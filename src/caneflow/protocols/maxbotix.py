@@ -54,7 +54,7 @@ def _tried(attempt: Callable[[], bytes], pause: Callable[[float], None]) -> byte
 
 
 class SerialWords:
-    """The distances in what a serial line brings, in whatever pieces; what is no word is left out and counted."""
+    """The distances in what a serial line brings, in whatever pieces; what is not a word is left out and counted."""
 
     def __init__(self, unit: Unit) -> None:
         self.garbled = 0  # bytes

@@ -48,7 +48,7 @@ class Faults:
     short: float = 0.0  # part of all reads that end before their last bytes
     freezes: tuple[Span, ...] = ()  # the values stand still, unless there is a reset
     unplugs: tuple[Span, ...] = ()  # nobody on the bus; then the chip has been powered on
-    resets: tuple[float, ...] = ()  # the chip starts anew by itself
+    resets: tuple[float, ...] = ()  # the chip starts again by itself
     overflows: tuple[Span, ...] = ()  # a magnet is too near
 
 
@@ -215,7 +215,7 @@ class Emulator:
 
 
 class Bench:
-    """A bus with an emulated chip on it, on a clock that goes on only when somebody waits or talks."""
+    """A bus with an emulated chip on it, on a clock that goes on only when someone waits or talks."""
 
     def __init__(self, emulator: Emulator, *, time: float = 0.0) -> None:
         self.emulator = emulator

@@ -22,7 +22,7 @@ from caneflow.protocols.mrm_scans import CLOCK_SPAN, LOG_HEAD_BYTES, millisecond
 RESOLUTION = 32  # bins per sample: the only one there is
 MOST_OVERTAKING = 3  # packets that may overtake a reordered one
 LONGEST_HELD = 0.02  # s that a reordered packet is held when nothing overtakes it
-LONGEST_REORDERED_MS = 2000  # a clock that goes back further was started anew; how long that took is not in the log
+LONGEST_REORDERED_MS = 2000  # a clock that goes back further was started again; how long that took is not in the log
 READY_ID = 0
 
 Chance = Annotated[float, Ge(0), Le(1)]
@@ -43,7 +43,7 @@ class Faults:
     loss: Chance = 0.0  # of each datagram, in either direction
     reorder: Chance = 0.0  # of each scan packet: up to MOST_OVERTAKING others arrive before it
     duplicate: Chance = 0.0  # of each scan packet
-    freezes: tuple[Span, ...] = ()  # it answers, but no scans come, unless it is started anew
+    freezes: tuple[Span, ...] = ()  # it answers, but no scans come, unless it is started again
     unplugs: tuple[Span, ...] = ()  # no power; then it has booted, and does not scan
 
 

@@ -62,7 +62,7 @@ def assembled(packets: Iterable[ScanInfo]) -> tuple[tuple[Scan, ...], AssemblyCo
 def missing_scans(scans: Sequence[Scan]) -> int:
     """How many are missing between the scans of one radar and kind, by message ids that count scans; else 0.
 
-    Where the id leaps farther than the clock leaves room for, it was set anew, and the clock says how many.
+    Where the id leaps farther than the clock leaves room for, it was set again, and the clock says how many.
     """
     ids = [(later.message_id - earlier.message_id) % ID_SPAN for earlier, later in pairwise(scans)]
     times = [milliseconds_after(later.timestamp_ms, earlier.timestamp_ms) for earlier, later in pairwise(scans)]

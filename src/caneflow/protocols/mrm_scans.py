@@ -175,7 +175,7 @@ class ScanAssembler:
         patience_ms: int = 25,  # ms of the radar's clock
         most_pending: int = 16,  # scans per radar
         most_sources: int = 8,
-        restart_ms: int = 2000,  # ms: a clock that goes back further was started anew
+        restart_ms: int = 2000,  # ms: a clock that goes back further was started again
         period_ms: float | None = None,  # ms between scans, a guess until some have come; inf: no idea
     ) -> None:
         self.counts = AssemblyCounts()

@@ -20,7 +20,7 @@ class Verdict(Enum):
     """What a reading is."""
 
     NEW = auto()
-    REPEATED = auto()  # the values were read before: it is no sample
+    REPEATED = auto()  # the values were read before: it is not a sample
     FROZEN = auto()  # the values have not changed for long: the chip's fusion stands still
 
 
@@ -88,7 +88,7 @@ class Spacing:
         self.clear()
 
     def clear(self) -> None:
-        """Begin anew, with the interval from the last sample to the next."""
+        """Begin again, with the interval from the last sample to the next."""
         self.count = 0  # intervals
         self.gaps = 0
         self.longest = 0.0  # s, gaps aside

@@ -173,7 +173,7 @@ def _points(parts: Sequence[tuple[int, bytes]], version: int) -> _Found:
 
 def _table(value: bytes, kind: str, columns: int) -> Floats:
     if len(value) % (columns * np.dtype(kind).itemsize):
-        raise ProtocolError(f"points of {len(value)} bytes, which is no number of rows")
+        raise ProtocolError(f"points of {len(value)} bytes, which is not a whole number of rows")
     return np.frombuffer(value, kind).reshape(-1, columns).astype(np.float32)
 
 
@@ -213,7 +213,7 @@ def _units(value: bytes, count: int, row: np.dtype, between: int) -> tuple[list[
     """The units in front of compressed points, and the points behind `between` more bytes."""
     head = 4 * count + between
     if len(value) < head or (len(value) - head) % row.itemsize:
-        raise ProtocolError(f"compressed points of {len(value)} bytes, which is no number of rows")
+        raise ProtocolError(f"compressed points of {len(value)} bytes, which is not a whole number of rows")
     return list(struct.unpack_from(f"<{count}f", value)), np.frombuffer(value, row, offset=head)
 
 

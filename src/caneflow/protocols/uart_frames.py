@@ -75,7 +75,7 @@ _SATURATED, _GAP = 1, 2
 REFUSALS = {
     1: "it is not a message of its kind",
     2: "it has no orientation",
-    3: "its orientation is no rotation",
+    3: "its orientation is not a rotation",
     4: "it has neither linear_accel nor accel",
     5: "its stamp is not after the one before",
 }
@@ -143,7 +143,7 @@ def decoded(coded: bytes) -> bytes:
         code = coded[at]
         block = coded[at + 1 : at + code]
         if code == 0 or len(block) != code - 1 or 0 in block:
-            raise ProtocolError(f"{len(coded)} bytes are no COBS: code {code} at {at}")
+            raise ProtocolError(f"{len(coded)} bytes are not COBS: code {code} at {at}")
         content += block
         at += code
         if code <= _BLOCK and at < len(coded):
@@ -154,7 +154,7 @@ def decoded(coded: bytes) -> bytes:
 class Deframer:
     """Finds frames in a stream of bytes that may start anywhere and be damaged; holds less than one frame.
 
-    bad: stretches between two zeros that were no frame.
+    bad: stretches between two zeros that were not frames.
     """
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ def structured(samples: Sequence[Sample]) -> NDArray[np.void]:
     numbers that some samples lack become float64.
 
     Raises:
-        ValueError: an array changes its shape from sample to sample, so that it is no column.
+        ValueError: an array changes its shape from sample to sample, so that it is not a column.
     """
     if not samples:
         return np.empty(0, dtype=[("stamp", np.int64), ("seq", np.int64)])

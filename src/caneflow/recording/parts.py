@@ -1,4 +1,4 @@
-"""A recording in parts: a new file by size or time, or the last seconds when somebody asks for them."""
+"""A recording in parts: a new file by size or time, or the last seconds when someone asks for them."""
 
 import errno
 import os
@@ -144,7 +144,7 @@ class Kept(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """What was written when somebody asked."""
+    """What was written when someone asked."""
 
     path: Path
     samples: int

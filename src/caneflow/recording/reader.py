@@ -62,7 +62,7 @@ EXPECTED = "a recording is an MCAP file as `caneflow run --record` writes it"
 End: TypeAlias = tuple[int, int] | tuple[None, None]  # stamp (ns) and seq
 NEVER: End = (None, None)
 
-# Blocks by file and offset, while somebody reads them: a host in one process has a reader per source of the graph.
+# Blocks by file and offset, while someone reads them: a host in one process has a reader per source of the graph.
 _contents: WeakValueDictionary[tuple[tuple[int, ...], int], Content] = WeakValueDictionary()
 
 
@@ -131,7 +131,7 @@ class Recording:
     streams: by (node, port), in the order in which they were recorded first.
     control: number of messages by key, of what the flow said about itself.
 
-    Raises RecordingError, here and in every method, for a file that is no recording or that is damaged.
+    Raises RecordingError, here and in every method, for a file that is not a recording or that is damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -468,13 +468,13 @@ def rig_in(path: Path, text: str) -> dict[str, Any]:
         raise RecordingError(f"{path}: the rig in it has {len(text)} characters; at most {MAX_RIG} are read")
     try:
         rig = json.loads(text)
-        json.dumps(rig, ensure_ascii=False).encode()  # half a surrogate pair is no text
+        json.dumps(rig, ensure_ascii=False).encode()  # half a surrogate pair is not text
     except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{path}: the rig in it is no JSON: {error}") from error
+        raise RecordingError(f"{path}: the rig in it is not JSON: {error}") from error
     if not isinstance(rig, dict):
         raise RecordingError(f"{path}: the rig in it is not a map but {text[:60]!r}")
     if _is_deeper(rig, MAX_RIG_DEPTH):
-        raise RecordingError(f"{path}: the rig in it is nested more than {MAX_RIG_DEPTH} deep; that is no rig")
+        raise RecordingError(f"{path}: the rig in it is nested more than {MAX_RIG_DEPTH} deep; that is not a rig")
     return rig
 
 

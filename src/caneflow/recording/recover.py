@@ -32,7 +32,7 @@ class Recovered:
 def recover(path: str | Path, output: str | Path) -> Recovered:
     """Copy every message of `path` up to its cut, and its metadata, to the sound file `output`.
 
-    Raises NothingLeftError, and leaves no file, when what is left of `path` is no recording; RecordingError when it is
+    Raises NothingLeftError, without a file, when the rest of `path` is not a recording; RecordingError when it is
     no MCAP file, or when `output` cannot be written.
     """
     path, output = Path(path), Path(output)

@@ -26,7 +26,7 @@ class SoundFile:
     """One file; what it is can be asked before its blocks are drawn."""
 
     def __init__(self, path: str | Path, channels: ModuleChannels, *, block: float) -> None:
-        """Blocks of `block` s. Raises RecordingError for a file that is no sound, or lacks the channels."""
+        """Blocks of `block` s. Raises RecordingError for a file that is not sound, or lacks the channels."""
         self.path = Path(path)
         self.refused = 0  # blocks that held NaN or infinity
         self._channels = channels

@@ -171,7 +171,7 @@ def _with_recorder_in_group(plans: Mapping[str, NodePlan], recorder: str, site: 
 
 
 def _require_open(graph: Graph, plans: Mapping[str, NodePlan], here: Site | None) -> None:
-    """Raise DataflowError when a program of somebody else's is part of the flow here and nobody listens for it."""
+    """Raise DataflowError when a program of someone else's is part of the flow here and nobody listens for it."""
     for name in (name for name, plan in plans.items() if plan.external):
         listens = here is not None and bool(here.listen or here.router)
         if not listens and (here is None or here.places[name] == here.name):

@@ -23,11 +23,11 @@ class InputPlan(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     writer: str  # the node at the other end
     clock: str = ""  # the machine whose clock its stamps are on, when that is not this one
     length: int | None = None  # how many samples may wait; the oldest is dropped beyond. None: all
-    max_lag_ms: float | None = None  # live: how long the graph waits for this input. None: for ever
+    max_lag_ms: float | None = None  # live: how long the graph waits for this input. None: forever
     max_age_ms: float | None = None  # live: older samples are dropped. None: never
     left_out: tuple[int, ...] = ()  # stamps (ns) of samples that the recorded live run did not handle
     budget: int = SENT  # bytes that its writer may keep of it
-    external: bool = False  # its writer is a program of somebody else's: it comes and goes, and cannot be asked
+    external: bool = False  # its writer is a program of someone else's: it comes and goes, and cannot be asked
 
     @cached_property
     def kind(self) -> type[Sample]:
@@ -88,7 +88,7 @@ class NodePlan(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def external(self) -> bool:
-        """Whether it is a program of somebody else's, which no launcher starts."""
+        """Whether it is a program of someone else's, which no launcher starts."""
         return self.module is None and self.file is None
 
     @property

@@ -108,7 +108,7 @@ def left_out_of(graph: Graph, recording: Recording) -> LeftOutStamps:
 
 
 class _Numbers:
-    """Ranges of numbers, given by their first and last: many, so that looking through all for each sample is no way."""
+    """Ranges of numbers, given by their first and last. There are many, so they are not searched for each sample."""
 
     def __init__(self, ranges: Iterable[tuple[int, int]]) -> None:
         self._firsts: list[int] = []

@@ -85,7 +85,7 @@ def door_of(graph: "Graph", listen: str | None) -> Site | None:
 
 
 def with_endpoint(site: Site, listen: str | None) -> Site:
-    """The same, listening at `listen` as well; raises DataflowError when that is no endpoint."""
+    """The same, listening at `listen` as well; raises DataflowError when that is not an endpoint."""
     if listen is None:
         return site
     from caneflow.runtime.dataflow.yaml_shape import ENDPOINT_PATTERN

@@ -101,7 +101,7 @@ def _fresh(name: str, file: Path) -> ModuleType:
 
 def _imported(file: Path) -> ModuleType:
     try:
-        with redirect_stdout(sys.stderr):  # what a file prints is no answer of ours
+        with redirect_stdout(sys.stderr):  # what a file prints is not an answer of ours
             return _member(file)
     except (Exception, SystemExit) as error:  # a user's file may do anything while it is imported
         raise DataflowError(f"{file} cannot be imported: {type(error).__name__}: {one_line(error)}") from error

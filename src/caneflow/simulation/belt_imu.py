@@ -68,7 +68,7 @@ _EVERY = RATE // SAMPLE_RATE
 
 
 def belt(settings: BeltImuSettings, rng: Generator) -> Belt:
-    """A belt as somebody puts it on."""
+    """A belt as someone puts it on."""
     angles = rng.normal(0.0, 1.0, 3) * [settings.belt_tilt, settings.belt_tilt, settings.belt_turn]
     return Belt(
         turned=attitude.from_rotation_vector(angles[None])[0],

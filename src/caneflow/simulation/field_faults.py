@@ -22,7 +22,7 @@ NotNegative = Annotated[float, Ge(0)]
 Share = Annotated[float, Ge(0), Lt(1)]
 
 # Seconds: reads of a BNO055 that take 100 to 200 ms now and then (github adafruit/Adafruit_CircuitPython_BNO055 #129),
-# and a chip that is set up anew after them (reset 0.65 s, data sheet table 0-2)
+# and a chip that is set up again after them (reset 0.65 s, data sheet table 0-2)
 HOLE = (0.05, 0.65)
 SCANS_PER_GAP = (1, 2, 3)  # p440-udp-loss, test_scan711_1000: 32 gaps of one (2), two (19) or three (11) scans
 GAP_SHARES = (2 / 32, 19 / 32, 11 / 32)
@@ -84,7 +84,7 @@ def glitched(imu: ImuSamples, faults: FieldFaults, rng: Generator) -> ImuSamples
 
 
 def stated_rig(rig: Rig, faults: FieldFaults, rng: Generator) -> dict[str, Any]:
-    """The rig as somebody measured it, as in wire.md."""
+    """The rig as someone measured it, as in wire.md."""
     turn, *shifts = (_direction(rng) for _ in range(3))
     higher = faults.rig_shift * (1.0 if rng.random() < 0.5 else -1.0)
     stated: dict[str, Any] = rig.as_map()

@@ -217,7 +217,7 @@ def table(rng: Generator, offset: float) -> Thing:
 
 
 def person(rng: Generator, offset: float) -> Thing:
-    """Somebody who comes towards the walker, and stops before they meet."""
+    """Someone who comes towards the walker, and stops before they meet."""
     wide, deep, tall = 0.44, 0.44, float(rng.uniform(1.55, 1.85))
     y0, y1 = offset - 0.5 * wide, offset + 0.5 * wide
     clothes, skin = float(rng.uniform(0.15, 0.8)), 0.5

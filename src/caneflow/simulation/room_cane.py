@@ -1,4 +1,4 @@
-"""Somebody with a white cane in a room of static Doppler modules: one walk, both sensor sets, one truth.
+"""Someone with a white cane in a room of static Doppler modules: one walk, both sensor sets, one truth.
 
 The person follows the cane's course (walk.py), moved to the middle of the room. The cane's radar and IMU hear and feel
 it as scenario.py has it; the modules see the person's body as room_walk.py has it, whose steps are not those of the

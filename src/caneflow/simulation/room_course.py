@@ -291,7 +291,7 @@ def _random(low: Floats, high: Floats, settings: CourseSettings, rng: Generator)
     while length < 100.0:
         there = rng.uniform(low, high)
         step = float(np.linalg.norm(there - points[-1]))
-        if step >= 2.0:  # m, chosen: a shorter way is no leg
+        if step >= 2.0:  # m, chosen: a shorter way is not a leg
             points.append(there)
             length += step
     path = np.array(points)

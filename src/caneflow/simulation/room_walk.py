@@ -52,7 +52,7 @@ class PersonSettings:
 
 
 class Person(NamedTuple):
-    """Somebody with a body of their own."""
+    """Someone with a body of their own."""
 
     height: float  # m
     trunk: float  # m^2
@@ -96,7 +96,7 @@ class Seen(NamedTuple):
 
 
 def person(settings: PersonSettings, rng: Generator) -> Person:
-    """Somebody."""
+    """Someone."""
     height = float(np.clip(rng.normal(settings.height, settings.height_spread), 1.5, 1.95))
     trunk = settings.trunk * 10.0 ** (0.1 * rng.normal(0.0, settings.trunk_spread))
     amplitudes = np.clip(1.0 + settings.gait_spread * rng.normal(0.0, 1.0, 7), 0.5, 1.5)
@@ -114,7 +114,7 @@ def person(settings: PersonSettings, rng: Generator) -> Person:
 
 
 def gait(way: Trajectory, who: Person, settings: PersonSettings, rng: Generator) -> Gait:
-    """Somebody walks a trajectory."""
+    """Someone walks a trajectory."""
     leg = who.height * _LEG
     speed = np.hypot(way.velocity[:, 0], way.velocity[:, 1])
     relative = speed / leg
@@ -157,7 +157,7 @@ def gait(way: Trajectory, who: Person, settings: PersonSettings, rng: Generator)
 
 
 def body(walk: Gait, who: Person, settings: PersonSettings) -> Body:
-    """The points of somebody who walks: trunk, head, and three on each limb."""
+    """The points of someone who walks: trunk, head, and three on each limb."""
     limbs, sections = [_head(walk, who)], [_SURFACE["head"]]
     for side in (1.0, -1.0):  # left, right
         limbs += _arm(walk, who, side)
@@ -177,24 +177,24 @@ def body(walk: Gait, who: Person, settings: PersonSettings) -> Body:
     )
 
 
-def seen_from(somebody: Body, sensor: Floats, settings: PersonSettings, rng: Generator) -> Seen:
+def seen_from(someone: Body, sensor: Floats, settings: PersonSettings, rng: Generator) -> Seen:
     """What a sensor at `sensor` (3,) m has before it: points, and which way they are turned.
 
     The trunk is an upright elliptic cylinder. Its specular point is where the skin faces the sensor, so it glides
     around the trunk as a person turns; points fixed on the skin are seen as far as they face the sensor.
     """
-    time = np.arange(len(somebody.facing)) / RATE
+    time = np.arange(len(someone.facing)) / RATE
     fluctuation = 10.0 ** (0.05 * slow(rng, settings.fluctuation, settings.fluctuation_scale)(time))
-    direction = np.arctan2(sensor[1] - somebody.axis[:, 1], sensor[0] - somebody.axis[:, 0])
-    aspect = direction - somebody.facing
-    section = somebody.trunk * (1.0 + settings.aspect * np.cos(2.0 * aspect))
-    specular = somebody.axis + _on_skin(aspect, somebody.facing)
-    towards = np.cos(direction - somebody.patch_facing)
+    direction = np.arctan2(sensor[1] - someone.axis[:, 1], sensor[0] - someone.axis[:, 0])
+    aspect = direction - someone.facing
+    section = someone.trunk * (1.0 + settings.aspect * np.cos(2.0 * aspect))
+    specular = someone.axis + _on_skin(aspect, someone.facing)
+    towards = np.cos(direction - someone.patch_facing)
     # the mean square of 2 max(0, cos) over all aspects is 1
     patches = np.sqrt((1.0 - settings.specular_share) / len(towards) * section) * 2.0 * np.maximum(towards, 0.0)
-    limbs = np.sqrt(somebody.limb_sections)[:, None] * np.ones_like(aspect)
+    limbs = np.sqrt(someone.limb_sections)[:, None] * np.ones_like(aspect)
     return Seen(
-        points=np.concatenate([specular[None], somebody.patches, somebody.limbs]),
+        points=np.concatenate([specular[None], someone.patches, someone.limbs]),
         amplitudes=np.concatenate(
             [
                 (fluctuation * np.sqrt(settings.specular_share * section))[None],

@@ -31,7 +31,7 @@ class SceneSettings:
     # Handbook of Radar Scattering Statistics for Terrain, 1989); it matters only against wall, person and tip
     floor_reflectivity: Annotated[float, Gt(0)] = 0.03  # m^2 per m^2
     walls: bool = False  # four walls around the course
-    person: bool = False  # somebody who walks the same course the other way
+    person: bool = False  # someone who walks the same course the other way
 
 
 class Walker(NamedTuple):

@@ -78,7 +78,7 @@ class LiveStreams:
         schema: of a message whose type is not known here, so that it is a bare Sample.
         """
         if self._live and message.stamp - received > FAR_AHEAD_NS:
-            return  # it would be drawn where nothing else comes for ever; its number counts as missing
+            return  # it would be drawn where nothing else comes forever; its number counts as missing
         row = row_of(message, self._boresight)
         with self._lock:
             if self._origin is None:
@@ -126,7 +126,7 @@ class LiveStreams:
             return [packets.packet("batch", origin=self._origin_s(), streams=streams)] if streams else []
 
     def batch(self, *, watched: bool = True) -> bytes:
-        """What is new but the map, whether somebody watches or not."""
+        """What is new but the map, whether someone watches or not."""
         now = time.monotonic()
         values: dict[str, Any] = {"ended": self._ended}
         with self._lock:
@@ -160,7 +160,7 @@ class LiveStreams:
         return (self._origin or 0) * 1e-9
 
     def _note_number(self, stream: _Stream, seq: int) -> None:
-        if seq > stream.last_seq:  # else: a source that began anew
+        if seq > stream.last_seq:  # else: a source that began again
             stream.gaps += seq - stream.last_seq - 1
         stream.last_seq = seq
         stream.count += 1

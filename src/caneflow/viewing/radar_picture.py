@@ -46,7 +46,7 @@ class RadarWindow:
         self._last: RadarFrame | None = None
 
     def take(self, frame: RadarFrame) -> None:
-        """Add a frame's scans; one of another make begins anew."""
+        """Add a frame's scans; one of another make begins again."""
         if self._last is not None and (
             frame.scans.shape[1] != self._last.scans.shape[1] or frame.range_step != self._last.range_step
         ):

@@ -26,7 +26,7 @@ class RecordedStreams:
     lossless = True  # the packets lie ready: a slow page is given all of them
 
     def __init__(self, path: Path) -> None:
-        """Raises RecordingError for a file that is no recording, or that holds no sample."""
+        """Raises RecordingError for a file that is not a recording, or that holds no sample."""
         self._path = path
         with Recording(path) as recording:
             span = recording.span()

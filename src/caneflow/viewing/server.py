@@ -52,11 +52,11 @@ class Feed(Protocol):
         ...
 
     def batch(self, *, watched: bool) -> bytes | None:
-        """What is new since the last one; `watched`: somebody looks."""
+        """What is new since the last one; `watched`: someone looks."""
         ...
 
     def picture(self) -> bytes | None:
-        """What is new and takes long to make; asked for between two batches, when somebody looks."""
+        """What is new and takes long to make; asked for between two batches, when someone looks."""
         ...
 
     def answer(self, request: dict[str, Any]) -> bytes | None:

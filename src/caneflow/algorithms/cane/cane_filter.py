@@ -115,7 +115,7 @@ class _Spread(NamedTuple):
 
 
 _HISTORY: Final = 64  # IMU samples that a velocity may come late
-_LARGEST_SPREAD: Final = 2.0  # m/s; what is wider is no ground
+_LARGEST_SPREAD: Final = 2.0  # m/s; what is wider is not ground
 _LONGEST_SPREAD: Final = 0.6  # s by which it may lag: as far as the history reaches
 _VERTICAL: Final = 1e-6  # horizontal part of a unit vector, below which it has no direction
 _UNOBSERVED: Final = 1e5  # (m/s)^2, from which on a component says nothing
@@ -277,7 +277,7 @@ class CaneFilter(DeadReckoning):
         return self._estimate(orientation)
 
     def local(self) -> PoseEstimate:
-        """The pose as of the last sample in a frame that is never laid anew: for a map of the last seconds.
+        """The pose as of the last sample in a frame that is never laid again: for a map of the last seconds.
 
         What is learnt of the gyro turns what comes, and not what was. The frame drifts away from R0 as the gyro does.
         The growth of the position's covariance between two poses is that of the way between them, over 1 to 5 s, in
@@ -447,7 +447,7 @@ class CaneFilter(DeadReckoning):
             motion.observe_velocity((left.real, left.imag), value, variance, per_pointing=-speed)
 
     def _use_way(self) -> None:
-        """Over a full swing the hand goes where the cane pointed in the mean, but for what a turning body adds."""
+        """Over a full swing the hand goes where the cane pointed on average, but for what a turning body adds."""
         settings, motion, swing = self._settings, self._motion, self._swing
         since = swing.full(cmath.phase(self._facing), self._arm)
         if since is not None:

@@ -1,7 +1,7 @@
 """`smoothed`: the track of a whole walk in hindsight, for evaluation; the same models as `best`, run both ways.
 
 Forward the filter of cane_filter.py. Then backward over its states (Rauch, Tung and Striebel, AIAA Journal 3(8), 1965),
-and the whole track anew with the heading that the walk's end has taught.
+and the whole track again with the heading that the walk's end has taught.
 """
 
 import cmath

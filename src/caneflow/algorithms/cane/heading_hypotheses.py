@@ -224,7 +224,7 @@ class HeadingHypotheses:
         return bool(1.0 / (by_bias**2).sum() < _TOO_FEW)
 
     def _rebuild(self, knots: list[Knot]) -> None:
-        """Hypotheses where the weight is, with tracks from all knots anew."""
+        """Hypotheses where the weight is, with tracks from all knots again."""
         mean = self.bias
         spread = math.sqrt(float((self._weights * (self._biases - mean) ** 2).sum()))
         cell = float(np.diff(self._biases[:: len(_SCALES)]).min())

@@ -67,7 +67,7 @@ class LuenbergerObserver(DeadReckoning):
     """One state (a, v) per axis of R0, advanced from IMU sample to IMU sample.
 
     x(k+1) = A x(k) + L (y(k) - C x(k)), p(k+1) = p(k) + T v(k+1), with T the measured interval (row 11).
-    L is computed anew from each T, so the poles stay where they are set; an explicit `gain` is used as given.
+    L is computed again from each T, so the poles stay where they are set; an explicit `gain` is used as given.
     Where no valid speed has come since the last sample, the velocity row is A's alone (row 10).
     Over a gap (more than LONGEST_INTERVAL) the last velocity holds: a constant acceleration would be an invention.
     """

@@ -6,13 +6,13 @@ step of either leg. A hand or a cane swings once per step.
 
 import math
 
-SMOOTHING = 0.05  # s, of each of two low passes: a heel's impact is no bob of its own
+SMOOTHING = 0.05  # s, of each of two low passes: a heel's impact is not a bob of its own
 LEVEL_TIME = 1.0  # s over which what is level is averaged
 POWER_TIME = 2.0  # s, likewise of the bob's mean square
 LEAST_BOB = 0.3  # m/s^2: half of what a bob of 12 mm at 1.1 steps per second is
 HYSTERESIS = 0.5  # times the RMS, on both sides of level
 MEMORY = 6.0  # swings over which cycles are averaged
-STRIDE = 1.5  # cycles per swing, in the mean, from which on a swing is a stride
+STRIDE = 1.5  # cycles per swing, on average, from which on a swing is a stride
 
 
 class StepBob:

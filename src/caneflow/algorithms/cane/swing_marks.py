@@ -1,6 +1,6 @@
 """Full swings of the cane: marks at its turning points, or each second without a swing, and what happened between.
 
-Over a full swing the cane points in the mean where its bearer walks; at any instant it does not.
+Over a full swing the cane points on average where its bearer walks; at any instant it does not.
 """
 
 from collections import deque

@@ -61,7 +61,7 @@ class ZeroVelocitySettings:
     stance: StanceSettings = field(default_factory=StanceSettings)
     glitches: GlitchSettings = field(default_factory=worn_on_a_foot)  # of accel and gyro; nothing else is used
     velocity_noise: Density = 0.01  # m/s/sqrt(Hz), of a standing foot, which still rolls a little
-    rest_time: Time = 1.0  # s; a stance that lasts longer is no step: the foot does not turn either
+    rest_time: Time = 1.0  # s; a stance that lasts longer is not a step: the foot does not turn either
     turn_noise: Density = math.radians(0.05)  # rad/s/sqrt(Hz), of a foot at rest
     accel_noise: Density = 0.02  # m/s^2/sqrt(Hz); with what a foot adds: scale, bandwidth, impacts
     gyro_noise: Density = math.radians(0.02)  # rad/s/sqrt(Hz), likewise
@@ -225,7 +225,7 @@ class ZeroVelocity(DeadReckoning):
             p[block, block] += added**2 * np.eye(3)
 
     def _stop(self, gyro: Vector, interval: float) -> None:
-        """What a standing foot tells: a velocity of zero and, if it is no step, a gyro that reads its bias."""
+        """What a standing foot tells: a velocity of zero and, if it is not a step, a gyro that reads its bias."""
         settings = self._settings
         x, y, z = self._velocity
         self._correct(VELOCITY, (-x, -y, -z), settings.velocity_noise**2 / interval)

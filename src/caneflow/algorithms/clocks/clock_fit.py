@@ -34,7 +34,7 @@ class ClockFitSettings:
     bucket: Annotated[float, Gt(0)] = 1e9  # ns of which only the earliest arrival counts
     most_drift: Annotated[float, Gt(0)] = 5e-4  # of the device's clock against the host's, which may be slewed
     jump: Annotated[float, Gt(0)] = 50e6  # ns: a reading earlier than the line by more shows that a clock was set
-    period_change: Annotated[float, Gt(0)] = 2e-3  # part of the period; less is no reason to tell another one
+    period_change: Annotated[float, Gt(0)] = 2e-3  # part of the period; less is not a reason to tell another one
 
 
 class ClockFit:
@@ -43,7 +43,7 @@ class ClockFit:
     The least delay between device and host cannot be seen from the host: stamps are late by it, all alike.
 
     period: ticks between scans, None as long as it is not known. It stays the same until it is wrong by more than
-        `period_change`, so that what depends on it need not begin anew.
+        `period_change`, so that what depends on it need not begin again.
     missed: scans that are missing between the readings since the fit was made.
     restarts: how often a clock was found to have been set.
     """
@@ -53,7 +53,7 @@ class ClockFit:
         self._settings = settings or ClockFitSettings()
         self._count = PeriodCount(period, self._settings.period_change)
         self._line = LineBelow(self._settings)
-        self._reading: int | None = None  # the last one; None: the next begins anew
+        self._reading: int | None = None  # the last one; None: the next begins again
         self._ticks = 0  # unwrapped, of that reading
         self._fine = 0.0  # the same, with its fraction
         self._stamp = -(1 << 63)  # ns, the last that was told

@@ -2,7 +2,7 @@
 
 The gyro, less its bias, turns an attitude from sample to sample: exact, and it drifts. A reading counts for the
 interval before it: a gyro averages over at least that, or its readings would alias. In the world so found the
-motion's own acceleration averages out over a few seconds, since nobody speeds up for ever, and what is left of the
+motion's own acceleration averages out over a few seconds, since nobody speeds up forever, and what is left of the
 specific force is gravity: it is low-passed *there*, not in the turning body, and the attitude is turned by just so
 much that it points up. Yaw is corrected by the magnetometer alone, and only as far as the field looks undisturbed;
 inclination never is. What has to be corrected again and again is the gyro's bias.
@@ -90,7 +90,7 @@ class AttitudeFilter:
 
     @property
     def gaps(self) -> int:
-        """How many intervals were longer than LONGEST_INTERVAL; after each the attitude starts anew."""
+        """How many intervals were longer than LONGEST_INTERVAL; after each the attitude starts again."""
         return self._clock.gaps
 
     @property

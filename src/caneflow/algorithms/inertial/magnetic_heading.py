@@ -14,8 +14,8 @@ from caneflow.algorithms.inertial.initial_attitude import NORTH_YAW
 from caneflow.algorithms.quantities import Angle, Factor, Time
 from caneflow.algorithms.rotations import Vector, wrapped
 
-SMOOTHING = 0.1  # s, of strength and dip: the magnetometer's noise is no disturbance
-TURNING = math.radians(20.0)  # rad/s; a field that is steady while the body turns is no magnet that it carries
+SMOOTHING = 0.1  # s, of strength and dip: the magnetometer's noise is not a disturbance
+TURNING = math.radians(20.0)  # rad/s; a field that is steady while the body turns is not a magnet that it carries
 LARGEST_DISTRUST = 1000.0
 FAR = 10.0  # deviations; one that is further is distrusted no more, and its fourth power may be no number
 SETTLED = 1.5  # times the steady variance, below which corrections are of now, not of what was

@@ -15,7 +15,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Stamps: TypeAlias = NDArray[np.int64]
 
 START_NS = 500_000_000  # the yaw at the start is the mean of this long
-LARGEST_MISS_NS = 1_000_000_000  # a track that starts later or ends earlier than the truth by this is no track
+LARGEST_MISS_NS = 1_000_000_000  # a track that starts later or ends earlier than the truth by this is not a track
 LOCAL_DISTANCE = 2.0  # m ahead, of the point that is drawn again
 LOCAL_QUANTILE = 0.95
 RELATIVE_LENGTH = 1.0  # m of truth's path over which the relative error is taken

@@ -25,7 +25,7 @@ from caneflow.algorithms.radar.noise_floor import LEAST_POWER, NoiseFloor
 from caneflow.algorithms.radar.waveform_faults import mended
 
 INT16_FULL_SCALE = 32768.0
-# int16 without noise is a staircase, whose lines are no target's: ten times the power that rounding has as white noise
+# int16 without noise is a staircase, whose lines are no target: ten times the power that rounding has as white noise
 # in a window of 1024 samples, half a bit's
 STAIRCASE = 5e-12
 BEYOND = 2.0  # times the highest frequency of the band: what is stronger there is looked for, too
@@ -186,7 +186,7 @@ class SlidingSpectrum:
         self._floor = NoiseFloor(rows, spacing, self._length / count)
 
     def _bridge_or_forget(self, stamp_ns: int, scaled: NDArray[np.inexact]) -> None:
-        """A straight line where few samples are missing before these; where many are, the window begins anew."""
+        """A straight line where few samples are missing before these; where many are, the window begins again."""
         if self._make is None or self._last_ns is None:
             return
         count = len(scaled)

@@ -1,7 +1,7 @@
 """Velocities of a radar, one after the other: the last one, and what the accelerometer felt since, say where to look.
 
 A guess that is far from that must win by several points (`ego_velocity`), and a velocity that is far from it is not
-believed at once. The prediction is no part of the result, so that errors of one frame do not reach the next.
+believed at once. The prediction is not part of the result, so that errors of one frame do not reach the next.
 """
 
 import math

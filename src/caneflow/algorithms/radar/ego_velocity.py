@@ -93,7 +93,7 @@ def ego_velocity(
         doppler_limit: m/s, unambiguous to either side.
         settings: which points count, and what is refused.
         random: draws the threes; the same one gives the same velocity, bit by bit.
-        prior: where the velocity should be; it only chooses between guesses, and is no measurement.
+        prior: where the velocity should be; it only chooses between guesses, and is not a measurement.
     """
     count = len(doppler)
     if count < settings.fewest:

@@ -1,7 +1,7 @@
 """Radar frames, as they come, into what moves: analytic scans without their background, in even steps of time.
 
 Shared by all estimators of speed, so that none works it out twice. Lost scans leave zeros, the neutral value once
-the background is gone; a longer gap, or frames of another make, start anew and say so.
+the background is gone; a longer gap, or frames of another make, start again and say so.
 
 A scan counts as lost, and leaves no trace in the background, that is far stronger than the others (estimators.md), that
 repeats the one before for the third time (no receiver is without noise: it hangs), or whose frame says that it is of
@@ -57,7 +57,7 @@ class MovingReturnsSettings:
     """How the standing picture is removed and how gaps are met."""
 
     background_time: Time = 0.5  # s, time constant of the running mean (cane.md row 3)
-    longest_gap: Annotated[float, Ge(0), Le(2)] = 0.05  # s of scans that may be missing before all starts anew
+    longest_gap: Annotated[float, Ge(0), Le(2)] = 0.05  # s of scans that may be missing before all starts again
     # of the median power of 0.5 s and of the scan before: more is a wild scan; a cane that sets off gives a factor of 2
     wild_power: Factor = 6.0
 
@@ -80,7 +80,7 @@ class StandingPicture:
         self._background, self._to_analytic = background, to_analytic
 
     def scan(self) -> NDArray[np.complex64]:
-        """The running mean of the scans, shape (M,), without what a receiver adds that is no echo.
+        """The running mean of the scans, shape (M,), without what a receiver adds that is not an echo.
 
         Of real scans with soft ends of the band, so that none rings; of complex ones less the offset of I and Q,
         which is the same in all bins.
@@ -116,7 +116,7 @@ class MovingReturnsFilter:
         """The moving part of a frame's `scans`, shape (N, M), real or complex; `stamp_ns` is its last scan's.
 
         Raises:
-            ValueError: no scan at all, samples that are no numbers or absurdly large, a stamp that is not newer
+            ValueError: no scan at all, samples that are not numbers or absurdly large, a stamp that is not newer
                 than the frame's before, or a pulse that the range bins cannot hold.
         """
         count, bins = scans.shape
@@ -126,7 +126,7 @@ class MovingReturnsFilter:
             raise ValueError(f"a frame of {bins} bins; at most {MOST_BINS} are taken")
         kind = scans.dtype.kind
         if kind in "fc" and not np.abs(scans).max() <= LARGEST_SAMPLE:
-            # One NaN would stay in the running mean for ever; a huge value would become one.
+            # One NaN would stay in the running mean forever; a huge value would become one.
             raise ValueError(f"frame at {stamp_ns} ns has samples that are not finite or above {LARGEST_SAMPLE:g}")
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise ValueError(f"frame at {stamp_ns} ns is not newer than the last, {self._last_ns} ns")

@@ -87,7 +87,7 @@ class PaperSpeed:
         # are left over cost as much as all four.
         self._padded = np.zeros((math.ceil(count / 4) * 4, settings.transform), np.complex64)
         self._rows = self._padded[:count, : settings.window].T
-        # Room for what is worked out anew for every scan: to allot it costs as much as to fill it.
+        # Room for what is worked out again for every scan: to allot it costs as much as to fill it.
         self._transformed = np.zeros_like(self._padded)
         self._spectra = self._transformed[:count]
         self._row_power = np.zeros(self._spectra.shape, np.float32)

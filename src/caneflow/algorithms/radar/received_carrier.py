@@ -28,13 +28,13 @@ SLOWEST = 0.15  # m/s: a slower echo moves too little in a window
 FASTEST_TURN = 0.35  # turns between two scans, beyond which the sign of a Doppler frequency may be wrong
 CLEAR = 12.0  # times the median magnitude of the map
 COHERENT = 0.3  # of what an echo of a single speed would give; several in one place have less
-LEAST_LINES = 8  # of fast time in the band; fewer are no spectrum
+LEAST_LINES = 8  # of fast time in the band; fewer are not a spectrum
 GATE = 0.5  # m to either side of an echo
 ECHOES = 4  # per window, at most
 LEAST = 6  # echoes that a measurement takes
 # Hz of fast time where no pulse is: what the receiver itself makes, and so the noise to take off
 QUIET = (5.8e9, 7.8e9)
-CLEAR_POWER = 2.0  # times that noise, in the mean over the band: below it a window says too little
+CLEAR_POWER = 2.0  # times that noise, on average over the band: below it a window says too little
 # Relative, 1 sd: against the phase -0.5 % on the rail, 0.1, 0.3 and 1.5 % on three logs of a walker, known to 1 %
 CENTROID_ERROR = 0.01
 CENTROID_WINDOWS = 16  # after which a radar that runs is told the centroid, while the phase has not settled

@@ -74,7 +74,7 @@ def ground_stands(standing: NDArray[np.floating], rest: float, noise_share: floa
 
     Args:
         standing: shape (K,), power of the standing picture, the running mean of the scans, in each of K cells.
-        rest: mean power per cell of what is left of a scan without that picture, mostly noise; 0 is no receiver's.
+        rest: mean power per cell of what is left of a scan without that picture, mostly noise; 0 is not a receiver's.
         noise_share: part of the scans' noise power that is in the standing picture's.
         least: how many times `rest` the ground must have in half of the cells.
 

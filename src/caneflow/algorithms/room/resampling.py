@@ -1,7 +1,7 @@
 """Systematic resampling: which particles live on, and how often.
 
 One random number places a comb of N equally spaced teeth over the cumulated weights. A particle of weight w gets
-floor(N w) or ceil(N w) copies, N w in the mean; no other scheme with one draw spreads less (R. Douc, O. Cappe,
+floor(N w) or ceil(N w) copies, N w on average; no other scheme with one draw spreads less (R. Douc, O. Cappe,
 E. Moulines, "Comparison of resampling schemes for particle filtering", ISPA 2005).
 """
 

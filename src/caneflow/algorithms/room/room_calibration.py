@@ -134,7 +134,7 @@ def _alternating_signs(seconds: Floats, rates: Floats, settings: CalibrationSett
     walking = speeds[speeds > 0.0]
     threshold = settings.turning_share * float(np.median(walking)) if len(walking) else math.inf
     signs, sign, turned, was_walking = np.ones(len(speeds)), 1.0, -math.inf, False
-    smooth = np.convolve(speeds, np.ones(7) / 7.0, mode="same")  # a gap of one hop is no stop
+    smooth = np.convolve(speeds, np.ones(7) / 7.0, mode="same")  # a gap of one hop is not a stop
     for index, (at, speed) in enumerate(zip(seconds, smooth, strict=True)):
         if speed >= threshold:
             was_walking = True

@@ -63,7 +63,7 @@ class RoomEkfSettings:
     walk_time: Time = 2.0  # s, in which it comes back to 0
     along_noise: Density = 0.6  # m/s/sqrt(s), with an IMU, along the heading
     along_time: Time = 2.0  # s, in which it comes back to the usual speed
-    usual_speed: Speed | Zero = 0.9  # m/s, of somebody who walks
+    usual_speed: Speed | Zero = 0.9  # m/s, of someone who walks
     across_noise: Density = 0.3  # m/s/sqrt(s), with an IMU, across it
     across_speed: Speed = 0.1  # m/s, sd of the speed across the heading
     yaw_error: Angle | Zero = math.radians(7.0)  # rad, sd of beta
@@ -78,7 +78,7 @@ class RoomEkfSettings:
     gamma_error: Fraction | Zero = 0.0
     reference_range: Length = 6.0  # m, where k is right whatever gamma
     range_error: Factor = 0.1  # m, of sensors that measure it
-    edge_error: Length = 1.0  # m, sd of how far beyond the area's edge somebody may be
+    edge_error: Length = 1.0  # m, sd of how far beyond the area's edge someone may be
     degrees: DegreesOfFreedom = 4.0  # of freedom of the Student-t that all errors are taken to have
     gate: Annotated[float, Gt(1), Le(1000)] = 5.0  # sd beyond which a measurement is discarded
     way_noise: Density = 0.1  # m/sqrt(s), of dead reckoning

@@ -173,7 +173,7 @@ class HeadingHistory:
 class WayHistory:
     """The last positions by dead reckoning, in a frame whose origin is anywhere.
 
-    A step that nobody walks is a leap of the frame, as when a track is laid anew: no way is gone by it.
+    A step that nobody walks is a leap of the frame, as when a track is laid again: no way is gone by it.
     """
 
     FASTEST = 10.0  # m/s, a sprinter's

@@ -62,7 +62,7 @@ class Rays(NamedTuple):
 FREE_MARGIN: Final = 328  # 0.08 m, and two per cent: how far before its end a ray stops to free
 FREE_WITHOUT_TARGET: Final = 4915  # 1.2 m: "no target" may be black cloth, glass or sunlight
 FLOOR_BAND: Final = 3932  # 0.06 m, and two per cent of the range
-BELOW: Final = 6554  # 0.10 m, and half the band: less is no drop
+BELOW: Final = 6554  # 0.10 m, and half the band: less is not a drop
 BEYOND_FLOOR: Final = 1434  # 0.35 m
 
 

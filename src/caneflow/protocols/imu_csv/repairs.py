@@ -24,7 +24,7 @@ WHOLE = 500_000_000  # ns: times so far apart, with several readings each, canno
 
 OUTLIER = "whose time is an outlier"
 WRAPPED = "wraps of the counter, followed"
-RESET = "times that the clock went back or began anew; it goes on one reading later"
+RESET = "times that the clock wrapped, went back or was reset; it goes on one reading later"
 LATE = "rows later than their time, put in order"
 SPREAD = "readings with the stamp of the one before, spread evenly"
 TWICE = "rows written twice, taken once"

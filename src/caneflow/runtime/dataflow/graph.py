@@ -24,7 +24,7 @@ class Wire:
     port: str  # its output
     kind: type[Sample]  # what travels
     queue: Queue
-    max_lag_ms: float | None  # live: how long the reader waits for it; None: for ever
+    max_lag_ms: float | None  # live: how long the reader waits for it; None: forever
     max_age_ms: float | None  # live: older samples are dropped; None: none
 
     @property

@@ -157,7 +157,7 @@ def _looked_in() -> str:
 
 def _imported(where: Located) -> ModuleType:
     try:
-        with redirect_stdout(sys.stderr):  # what a program prints is no answer of ours
+        with redirect_stdout(sys.stderr):  # what a program prints is not an answer of ours
             return importlib.import_module(str(where.module)) if where.file is None else module_of(where.file)
     except (Exception, SystemExit) as error:  # a program may do anything while it is imported
         raise DataflowError(f"{where.file or where.module} cannot be imported: {_cause(error)}") from error

@@ -16,7 +16,7 @@ from caneflow.runtime.wording import did_you_mean, listed
 EVERYWHERE = {"0.0.0.0", "[::]"}  # noqa: S104 - compared with, not bound to
 HIGHEST_PORT = 65535
 NOBODY_LISTENS = (
-    "is a program of somebody else's, and this machine does not listen for it; "
+    "is a program of someone else's, and this machine does not listen for it; "
     "write e.g. machines: {here: {listen: [tcp/127.0.0.1:7447]}}, or give --listen tcp/127.0.0.1:7447"
 )
 RESERVED = {"ca", "observer", "router"}  # names among the keys of a flow

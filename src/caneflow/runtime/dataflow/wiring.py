@@ -199,7 +199,7 @@ def _cycles(parts: Mapping[str, Part]) -> Iterator[list[str]]:
             for name in free:
                 del left[name]
             continue
-        # Everybody left is read by somebody left and reads from somebody left: walking upstream meets itself.
+        # Everybody left is read by someone left and reads from someone left: walking upstream meets itself.
         walk = [next(iter(left))]
         while (writer := next(name for name in left if name in left[walk[-1]])) not in walk:
             walk.append(writer)

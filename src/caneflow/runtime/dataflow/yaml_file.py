@@ -106,7 +106,7 @@ def read_yaml(path: Path) -> Document:
 
 
 def compose(text: str, source: str) -> Document:
-    """The values of `text`; raises DataflowError when it is no YAML at all."""
+    """The values of `text`; raises DataflowError when it is not YAML at all."""
     yaml = YAML(typ="safe", pure=True)
     try:
         with warnings.catch_warnings():
@@ -128,7 +128,7 @@ def compose(text: str, source: str) -> Document:
     except _TooMuch as error:
         raise _broken(Place(source=source, line=1, column=1), str(error)) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, AssertionError) as error:
-        # ruamel's scanner has its own slips on texts that are no YAML (an AttributeError after a bad directive).
+        # ruamel's scanner has its own slips on texts that are not YAML (an AttributeError after a bad directive).
         raise _broken(Place(source=source, line=1, column=1), f"not YAML: {one_line(error)}") from error
     return document
 
@@ -220,7 +220,7 @@ class _Plain:
         tag = str(node.tag)
         if tag in TEXTS:
             if not _is_text(node.value):
-                self._document.refuse(path, "holds half a surrogate pair; that is no text")
+                self._document.refuse(path, "holds half a surrogate pair; that is not text")
                 return ""
             return node.value
         if tag == TAG + "null":
@@ -231,7 +231,9 @@ class _Plain:
         try:
             value = self._constructor.construct_object(node)
         except (ValueError, LookupError) as error:
-            self._document.refuse(path, f"{shown(node.value)} is no {tag.removeprefix(TAG)}: {one_line(error)}")
+            self._document.refuse(
+                path, f"{shown(node.value)} is not of type {tag.removeprefix(TAG)}: {one_line(error)}"
+            )
             return None
         if isinstance(value, float) and math.isnan(value):
             self._document.refuse(path, "is not a number; nothing can be set to that")

@@ -1,6 +1,6 @@
 """The reference of dataflow.yaml, written from its types: JSON Schema for editors, tables for docs/dataflow.md.
 
-`python -m caneflow.runtime.dataflow.yaml_reference docs` writes both anew.
+`python -m caneflow.runtime.dataflow.yaml_reference docs` writes both again.
 """
 
 import json
@@ -51,7 +51,7 @@ def schema_text() -> str:
 
 
 def with_tables(page: str) -> str:
-    """`page` with every table between `<!-- table NAME -->` and `<!-- end -->` written anew."""
+    """`page` with every table between `<!-- table NAME -->` and `<!-- end -->` written again."""
     return re.sub(
         r"<!-- table (\w+) -->\n.*?<!-- end -->",
         lambda found: f"<!-- table {found[1]} -->\n{table(found[1])}<!-- end -->",

@@ -53,7 +53,7 @@ class InputShape(Shape):
     ] = "all"
     max_lag_ms: Annotated[
         float | None,
-        Field(ge=0, le=3.6e6, description="ms, live: how long the node waits for this input; left out: for ever"),
+        Field(ge=0, le=3.6e6, description="ms, live: how long the node waits for this input; left out: forever"),
     ] = None
     max_age_ms: Annotated[
         float | None, Field(ge=0.1, le=3.6e6, description="ms, live: an older sample is dropped; left out: none is")

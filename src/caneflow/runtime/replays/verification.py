@@ -174,7 +174,7 @@ class _Comparison:
         for name, before in msgspec.structs.asdict(then).items():
             after = getattr(now, name)
             distance = _distance(before, after)
-            exact = name in ("stamp", "seq")  # these are no measurements
+            exact = name in ("stamp", "seq")  # these are not measurements
             if distance is None or distance > (0.0 if exact else self._tolerance):
                 return Difference(
                     seq=recorded.seq, stamp=recorded.stamp, field=name, recorded=_shown(before), now=_shown(after)

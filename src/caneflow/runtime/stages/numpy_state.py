@@ -48,7 +48,7 @@ def _dtype_to_data(dtype: "np.dtype[Any]") -> Any:
 
 
 def dtype_from_data(data: Any) -> "np.dtype[Any]":
-    """The dtype; raises SnapshotError for one whose elements are no plain data."""
+    """The dtype; raises SnapshotError for one whose elements are not plain data."""
     if isinstance(data, str):
         if data not in NATIVE.values() and not SIMPLE.fullmatch(data):
             raise SnapshotError(f"it names the dtype {data!r}; only plain ones are taken")
@@ -87,12 +87,12 @@ def scalar_from_data(dtype: Any, data: bytes) -> Any:
 
 
 def array_to_data(array: Anything, path: str) -> list[Any]:
-    """The dtype, shape, order of the axes in memory, and elements of an array that is no view of another one."""
+    """The dtype, shape, order of the axes in memory, and elements of an array that is not a view of another one."""
     if type(array) is not np.ndarray:
         raise SnapshotError(f"{path} is a {type(array).__name__}; of arrays only plain ones can be kept")
     dtype = array.dtype
     if dtype.hasobject or dtype.itemsize == 0:
-        raise SnapshotError(f"{path} is an array of {dtype}; its elements are no plain data")
+        raise SnapshotError(f"{path} is an array of {dtype}; its elements are not plain data")
     if not (array.flags.owndata or _is_constant(array.base)):
         raise SnapshotError(f"{path} is an array over memory of a {type(array.base).__name__}; it cannot be kept")
     axes = None if array.flags.c_contiguous else _axes(array)

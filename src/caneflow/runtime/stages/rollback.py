@@ -49,7 +49,7 @@ def blames_sample(error: Exception) -> str | None:
     if isinstance(error, MemoryError):
         return f"it takes more memory than there is: {one_line(error)}"
     if isinstance(error, MessageError) or (isinstance(error, ValueError) and _is_of_a_sample(error.__traceback__)):
-        return f"what follows from it is no sample: {one_line(error)}"
+        return f"what follows from it is not a sample: {one_line(error)}"
     return None
 
 

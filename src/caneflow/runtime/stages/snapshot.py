@@ -66,7 +66,7 @@ def unpack(snapshot: bytes, own_module: str) -> Any:
         return Unpacker(own_module).whole(msgspec.msgpack.decode(snapshot))
     except SnapshotError:
         raise
-    except Exception as error:  # the bytes may be damaged, or made by somebody
+    except Exception as error:  # the bytes may be damaged, or made by someone
         raise SnapshotError(f"it does not fit: {type(error).__name__}: {error}") from error
 
 

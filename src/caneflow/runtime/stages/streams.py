@@ -27,7 +27,7 @@ FAR_AHEAD = (
 FAR_AHEAD_UNKNOWN = 100 * 365 * 86_400 * 1_000_000_000  # ns, while the writer's clock is not known: 1970 to 2070
 SECOND_WRITER = 1_000  # samples of one writer between two of another, at most: more, and it was a restart
 NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]?\d+)?|\b(nan|inf)\b)")
-SILENCES_NAMED = 10  # per stream: one that is slow is not to be complained of for ever
+SILENCES_NAMED = 10  # per stream: one that is slow is not to be complained of forever
 
 
 @dataclass
@@ -102,7 +102,7 @@ class Arrivals:
     def admit(self, message: Sample, *, again: bool = False) -> list[Sample]:
         """The samples that are next in the stream now that `message` has come; counts it, and what is missing.
 
-        `again`: it was asked for, so it is no fault if it has come before.
+        `again`: it was asked for, so it is not a fault if it has come before.
         """
         if self.is_simply_next(message):
             self.take_next(message)
@@ -187,7 +187,7 @@ class Arrivals:
             self.expected = message.seq + 1
 
     def _next(self, message: Sample) -> Sample:
-        # A smaller seq with a newer stamp is a writer that was restarted and counts anew.
+        # A smaller seq with a newer stamp is a writer that was restarted and counts again.
         if message.seq < self.expected:
             self.newest, self.other, self.other_since = message.seq, self.expected, message.seq
         self._note_silence(message)

@@ -38,7 +38,7 @@ function sizeIn({ contentRect: { width, height }, devicePixelContentBoxSize: exa
   return { width: Math.round(width), height: Math.round(height), wide, high };
 }
 
-// Know this element's size from now on, so that nobody has to ask for it while drawing: to ask lays out the page anew.
+// Know this element's size from now on, so that nobody has to ask for it while drawing: to ask lays out the page again.
 export function watch(element, changed) {
   callbacks.set(element, changed);
   observer.observe(element, EXACT ? { box: "device-pixel-content-box" } : {});

@@ -6,7 +6,7 @@ import { SILENCE } from "./series.js";
 const UNSURE = 1.0; // m of the 2-sigma ellipse, from which on a position is called uncertain
 const CORRIDOR_STEP = 0.4; // semi-axes between two ellipses of the corridor
 const FIT = 0.5; // m: steps in which the whole is fitted, of a small one
-const WASTE = 0.7; // of what is shown is needed at least; below, the whole is fitted anew
+const WASTE = 0.7; // of what is shown is needed at least; below, the whole is fitted again
 const PAST_PERIOD = 700; // ms
 const LEAST_SPAN = 4; // m that are shown at least
 
@@ -94,12 +94,12 @@ export class Plan {
   }
 
   // Grid, room, corridor and all of the trail but its end: kept as a picture; what has come since is added now and
-  // then, and all of it is drawn anew when the view changes.
+  // then, and all of it is drawn again when the view changes.
   drawPast(context, tracks, ends, strokes, room, width, height, place) {
     const key = [this.centre, this.scale, width, height, ink("ink"), ...tracks.map(({ series, shift }) => series.name + shift)].join();
-    const anew = key !== this.pastKey || ends.some((end, i) => end < this.pastEnds[i]);
-    if (anew) this.forget(tracks);
-    if (anew || (performance.now() - this.pastAt > PAST_PERIOD && ends.some((end, i) => end > this.pastEnds[i]))) {
+    const again = key !== this.pastKey || ends.some((end, i) => end < this.pastEnds[i]);
+    if (again) this.forget(tracks);
+    if (again || (performance.now() - this.pastAt > PAST_PERIOD && ends.some((end, i) => end > this.pastEnds[i]))) {
       this.extend(tracks, ends, strokes, place);
       const { context: behind } = begin(this.past, { like: this.canvas });
       this.grid(behind, width, height, place);

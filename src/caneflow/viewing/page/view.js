@@ -16,7 +16,7 @@ const STALE = 1.5; // s without a new position, from which on it is said
 const RETRY = 1000; // ms between two attempts to connect
 const CALM_DRAWING = 500; // ms between two drawings when reduced motion is wanted
 const CALM_SCRUBBING = 700; // ms between two sentences while the time cursor is moved by hand
-const LONG_FRAME = 8; // ms that a frame may take in the mean; if longer, fewer charts are drawn with each
+const LONG_FRAME = 8; // ms that a frame may take on average; if longer, fewer charts are drawn with each
 const SHORT_FRAME = 4; // ms, below which there may be more
 const SMOOTHING = 0.1; // of that mean
 const MOST_TURNS = 100;
@@ -49,7 +49,7 @@ let lastSaid = 0;
 let turn = 0; // whose turn it is to be drawn
 let owed = 0; // how many of the charts and the map have not been drawn since something changed
 let share = 1; // how many of them are drawn with each frame
-let frame = LONG_FRAME; // ms that a frame takes, in the mean
+let frame = LONG_FRAME; // ms that a frame takes, on average
 let undrawn = []; // of a live flow: stamps of the poses that have come since the last drawing, s of the epoch
 const latencies = []; // s from a pose's stamp to the end of the frame that shows it
 const costs = []; // ms of the last drawings
@@ -330,7 +330,7 @@ function draw() {
   const speed = ground ? sampleAt(ground) : null;
   plan.draw(found, state.hello ?? {}, now(), stale);
   showNumbers(pose, speed, primary, stale);
-  if (state.cursor !== null) showTime(); // somebody moves it
+  if (state.cursor !== null) showTime(); // someone moves it
   drawInTurns();
 }
 

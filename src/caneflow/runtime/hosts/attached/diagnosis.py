@@ -173,7 +173,7 @@ def _links(node: NodeStatus, status: FlowStatus) -> Iterator[Finding]:
         listening, dialled = _endpoints_of(node.pid)
         dialled |= {endpoint for endpoint in node.connect if _takes_all(endpoint, status)}
     except psutil.Error:
-        return  # somebody else's process, or it has just ended
+        return  # someone else's process, or it has just ended
     listeners = {endpoint: other.node for other in status.nodes for endpoint in other.listen}
     for endpoint in node.listen:
         if endpoint not in listening:
@@ -276,7 +276,7 @@ def _edge(
 
 
 def _is_matched(session: zenoh.Session, key: str) -> bool:
-    """Whether somebody answers to `key`, as far as this session knows."""
+    """Whether someone answers to `key`, as far as this session knows."""
     querier = session.declare_querier(key)
     time.sleep(0.05)  # what is matched is told a moment after the declaration
     matched: bool = querier.matching_status.matching  # type: ignore[attr-defined]  # the stub says bool

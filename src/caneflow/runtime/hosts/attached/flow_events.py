@@ -1,4 +1,4 @@
-"""What somebody who follows a flow is told: it begins, a sample comes, how it is, it ends."""
+"""What someone who follows a flow is told: it begins, a sample comes, how it is, it ends."""
 
 from typing import NamedTuple, TypeAlias
 

@@ -31,7 +31,7 @@ class Finding:
 
 
 def way_to(endpoint: str, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
-    """Whether somebody listens at `endpoint`, and takes this side's certificate; a finding that is bad is the last."""
+    """Whether someone listens at `endpoint`, and takes this side's certificate; a finding that is bad is the last."""
     protocol, _, address = endpoint.partition("/")
     if protocol == UNIX:
         yield _way_to_socket(endpoint, address)
@@ -47,13 +47,13 @@ def way_to(endpoint: str, keys: Path = DEFAULT_KEYS) -> Iterator[Finding]:
         yield _no_way(endpoint, host, port, error)
         return
     with link:
-        yield Finding(node=endpoint, state="ok", text="somebody listens")
+        yield Finding(node=endpoint, state="ok", text="someone listens")
         if protocol == "tls":
             yield _handshake(endpoint, host, link, keys)
 
 
 def _way_to_socket(endpoint: str, path: str) -> Finding:
-    """Whether somebody listens at a Unix socket of this machine."""
+    """Whether someone listens at a Unix socket of this machine."""
     attempts: tuple[str, ...] = ("end the flow and start it again", "it is in the run's folder: was that removed?")
     try:
         with socket.socket(socket.AF_UNIX) as link:
@@ -68,7 +68,7 @@ def _way_to_socket(endpoint: str, path: str) -> Finding:
     except ValueError as error:
         text = f"not a path: {error}"
     else:
-        return Finding(node=endpoint, state="ok", text="somebody listens")
+        return Finding(node=endpoint, state="ok", text="someone listens")
     return Finding(node=endpoint, state="bad", text=text, attempts=attempts)
 
 

@@ -1,4 +1,4 @@
-"""Restarts that somebody asked for: a node ends in order and starts again at once; its policy does not count them."""
+"""Restarts that someone asked for: a node ends in order and starts again at once; its policy does not count them."""
 
 import time
 from collections.abc import Callable
@@ -51,7 +51,7 @@ class AskedRestarts:
         if node.state == "waiting":
             node.restart_at = time.monotonic()
             return
-        self._say(asked.node, "restart: somebody asked for it")
+        self._say(asked.node, "restart: someone asked for it")
         node.state = "ending"
         self._kill_at[name] = time.monotonic() + END_PATIENCE
         self._processes.ask_to_end(name)
@@ -93,7 +93,7 @@ class AskedRestarts:
             return Answer(error=f"no node {name!r};{did_you_mean(name, names)} there are {listed(names)}")
         node = self._nodes[name]
         if node.plan.external:
-            return Answer(error=f"{name} is somebody else's program: whoever started it starts it again")
+            return Answer(error=f"{name} is someone else's program: whoever started it starts it again")
         if not node.here:
             return Answer(elsewhere=True)
         if node.records:

@@ -112,7 +112,7 @@ def closed_in_time(session: zenoh.Session, listens: Iterable[str]) -> Iterator[z
 
 
 def _close(session: zenoh.Session) -> None:
-    with suppress(zenoh.ZError):  # it could not say goodbye to somebody
+    with suppress(zenoh.ZError):  # it could not say goodbye to someone
         session.close()  # type: ignore[no-untyped-call]  # the stub lacks its types
 
 
@@ -142,7 +142,7 @@ def _with_each_link(act: Callable[[socket.socket], None]) -> None:
     for number in sorted(int(path.name) for path in Path("/proc/self/fd").iterdir()):
         if number <= STANDARD_STREAMS:
             continue
-        with suppress(OSError):  # it is no socket, or closed meanwhile
+        with suppress(OSError):  # it is not a socket, or closed meanwhile
             link = socket.socket(fileno=number)
             try:
                 if link.type == socket.SOCK_STREAM and not link.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):

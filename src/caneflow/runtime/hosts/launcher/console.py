@@ -20,7 +20,7 @@ NARROW = 60  # columns of a terminal in which a bar has no room
 class Console:
     """Prints to the standard error; a context manager, at whose end the last line is free again.
 
-    On a terminal the last line is a replay's progress, written anew. Not by rich: that takes 0.1 s to import, and hides
+    On a terminal the last line is a replay's progress, rewritten. Not by rich: that takes 0.1 s to import, and hides
     the cursor, which a killed command would never show again.
     """
 

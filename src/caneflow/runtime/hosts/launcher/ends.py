@@ -19,7 +19,7 @@ RECORDER_RESTART = Restart(  # in a replay, of whatever process a recorder is in
 LIVE_RECORDER_RESTART = Restart(  # where the position is worth more than its recording: without end
     policy="always", max_restarts=sys.maxsize, window_s=60.0, delay_s=0.25, max_delay_s=10.0
 )
-RECORDS = "not started again: the recording of a replay is its result, and would begin anew in the middle"
+RECORDS = "not started again: the recording of a replay is its result, and would begin again in the middle"
 FAILING_SAID = 60.0  # s after which the launcher says again that the flow goes on without its recorder
 
 

@@ -32,7 +32,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class StatusAsked:
-    """Somebody wants to know how the flow is."""
+    """Someone wants to know how the flow is."""
 
     query: zenoh.Query
 

@@ -17,14 +17,14 @@ class NodeState:
     plan: NodePlan
     policy: Restarts
     spare: bool = False  # a live flow goes on without it: its recorder
-    records: bool = False  # a recorder of a replay runs in its process: the recording would begin anew in the middle
+    records: bool = False  # a recorder of a replay runs in its process: the recording would begin again in the middle
     here: bool = True  # False: another machine's launcher starts it
     state: str = "starting"  # starting, ready, ending (as asked), waiting (for its restart), failed; away: out of reach
     pid: int = 0
     started_at: float = 0.0  # s, monotonic
     restart_at: float = 0.0  # s, monotonic
     restarts: int = 0  # after it had failed
-    asked: int = 0  # restarts that somebody asked for
+    asked: int = 0  # restarts that someone asked for
     handled: int = BEGIN
     counters: Counters | None = None
     last_line: str = ""

@@ -52,7 +52,7 @@ class _Counted:
         self.at, self.now = at, counters
 
     def rate(self, now: int, before: int) -> float | None:
-        """Hz; None while there is no second count, or when the node was started anew between them."""
+        """Hz; None while there is no second count, or when the node was started again between them."""
         span = self.at - self.before_at
         return (now - before) / span if span >= RATE_SPAN and now >= before else None
 

@@ -146,7 +146,7 @@ class Nodes:
         if node is None:
             return
         if isinstance(message, Progress):
-            # A restarted reader begins anew: what it had handled before stands.
+            # A restarted reader begins again: what it had handled before stands.
             node.handled = max(node.handled, message.handled)
             return
         if node.here:

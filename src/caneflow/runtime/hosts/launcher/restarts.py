@@ -52,7 +52,7 @@ class Restarts:
             self._up_since = now
 
     def asked(self, now: float) -> None:
-        """Note an end at `now` (s) that somebody asked for: it does not count, and begins a new time of being up."""
+        """Note an end at `now` (s) that someone asked for: it does not count, and begins a new time of being up."""
         if self._up_since is not None and now - self._up_since >= self._policy.window_s:
             self.counted = 0
         self._up_since = None

@@ -209,7 +209,7 @@ def feeder_grants(deployment: Deployment, site: Site) -> tuple[Grants, Grants]:
     """An observer's rights, and to write what the external nodes of this machine do."""
     asks, gets = observer_grants(deployment.flow)
     written = external_keys(deployment, site, site.name)
-    # That somebody reads these keys is told to who writes them: without, a publisher sends nothing.
+    # That someone reads these keys is told to who writes them: without, a publisher sends nothing.
     return _together([asks, {"put": written}]), _together([gets, {"declare_subscriber": written}])
 
 

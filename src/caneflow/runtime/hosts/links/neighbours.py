@@ -33,7 +33,7 @@ class Outlet:
     """One key that is published, and whether anybody hears it."""
 
     def __init__(self, publisher: Any, *, watched: bool, patient: bool) -> None:
-        """`watched`: it can tell who hears it. `patient`: in its first second it waits until somebody does."""
+        """`watched`: it can tell who hears it. `patient`: in its first second it waits until someone does."""
         self._publisher = publisher
         self._watched = watched
         self._patient = patient
@@ -47,7 +47,7 @@ class Outlet:
 
     @property
     def is_heard(self) -> bool:
-        """Whether somebody listens, as far as this session knows; in its first second: yes."""
+        """Whether someone listens, as far as this session knows; in its first second: yes."""
         if not self._watched:
             return True
         while not self._matching:

@@ -133,7 +133,7 @@ class Bus:
         return self._inbox.held + sum(lane.held for lane in self._lanes.values())
 
     def _new_inbox(self, budget: int) -> Inbox[Event]:
-        # Live the newest counts; in a replay no more is on its way than there is room for, unless somebody forges.
+        # Live the newest counts; in a replay no more is on its way than there is room for, unless someone forges.
         return Inbox(budget, weight_of_event, self._drop, oldest_first=not self._plan.replay)
 
     def _drop(self, event: Event) -> None:
@@ -148,7 +148,7 @@ class Bus:
             self._inbox.put(event)
 
     def events(self, timeout: float | None) -> Iterator[Event]:
-        """Everything in the inbox, after waiting up to `timeout` s (None: for ever) for the first."""
+        """Everything in the inbox, after waiting up to `timeout` s (None: forever) for the first."""
         try:
             yield self._inbox.get(timeout=timeout)
             while not self._inbox.empty():

@@ -138,7 +138,7 @@ def on_window(put: Put) -> Callable[[zenoh.Sample], None]:
 
 
 def on_matching(begin: Callable[[], None], end: Callable[[], None]) -> Callable[[zenoh.MatchingStatus], None]:
-    """That somebody listens to a stream, or nobody any more."""
+    """That someone listens to a stream, or nobody any more."""
     return lambda status: begin() if status.matching else end()
 
 

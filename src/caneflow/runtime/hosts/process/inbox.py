@@ -47,7 +47,7 @@ class Inbox(Generic[E]):
         self._queue.put(event)
 
     def get(self, timeout: float | None = None) -> E:
-        """The next event; raises queue.Empty when none comes within `timeout` s (None: for ever)."""
+        """The next event; raises queue.Empty when none comes within `timeout` s (None: forever)."""
         event = self._queue.get(timeout=timeout)
         self._taken += self._weigh(event)
         return event

@@ -65,7 +65,7 @@ class Inputs:
         arriving = {port: wire for port, wire in plan.inputs.items() if (plan.node, port) in process.arriving}
         self._arriving: dict[str, Arrivals] = {port: self._reader.inputs[port] for port in arriving}
         self._missing: dict[str, _Missing] = {}
-        # Each writer is asked at the start what it has sent so far, until it answers: a node that is started anew may
+        # Each writer is asked at the start what it has sent so far, until it answers: a node that is started again may
         # have missed its last word, and the link to the writer may not be there yet.
         asked = [port for port, wire in arriving.items() if not wire.external]
         self._unanswered = dict.fromkeys(asked, 0.0)  # s, monotonic: when to ask next

@@ -13,7 +13,7 @@ HEARING_OUT = 1.0  # s, at most and for all lanes, for what has come when a node
 class Lane:
     """The thread of one input port.
 
-    Zenoh's receiving thread never waits for it: two nodes that wait for each other's would wait for ever. And a mark or
+    Zenoh's receiving thread never waits for it: two nodes that wait for each other's would wait forever. And a mark or
     an answer never overtakes the samples that its writer sent before it: they would seem missing.
     """
 

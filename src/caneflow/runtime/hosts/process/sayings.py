@@ -51,7 +51,7 @@ class Sayings:
         return progress
 
     def what_is_due(self) -> None:
-        """Say how far each node has come, when somebody waits for it or it is due, and what was counted."""
+        """Say how far each node has come, when someone waits for it or it is due, and what was counted."""
         for name, feed in self._group.feeds.items():
             if feed.ended or self.reports[name].due():
                 self.reports[name].progress(feed.progress())
@@ -116,7 +116,7 @@ class Sayings:
                 self.reports[name].marks(stage.progress())
 
     def what_was_left_out(self, name: str) -> None:
-        """Say what a node did not handle, once somebody hears it."""
+        """Say what a node did not handle, once someone hears it."""
         if name in self._stages and self._bus.hears_left_out:
             for note in self._stages[name].left_out():
                 self._bus.send_left_out(note)
