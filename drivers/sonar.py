@@ -6,8 +6,6 @@ Nothing nearer than 0.2 m is told apart. Two that hear each other must never mea
 """
 
 import logging
-import os
-import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,8 +18,9 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from caneflow.algorithms.quantities import Time
+from caneflow.i2c_bus import opened_bus
 from caneflow.messages import Ranges
-from caneflow.protocols import i2c_socket, maxbotix
+from caneflow.protocols import maxbotix
 from caneflow.protocols.errors import ProtocolError
 from caneflow.runtime import Brought, Context, Quiet, Source
 from caneflow.runtime.errors import DataflowError
@@ -75,10 +74,11 @@ class Sonar(Source):
             time.sleep(RETRY)
 
     def _on_i2c(self) -> Brought:
-        with opened_bus(self._settings.bus, self._settings.address) as transfer:
+        with opened_bus(self._settings.bus) as transfer:
+            chip = partial(transfer, self._settings.address)
             while True:
                 began = time.monotonic()
-                distance = maxbotix.taken(transfer, time.sleep)
+                distance = maxbotix.taken(chip, time.sleep)
                 elapsed = time.monotonic() - began
                 yield from self._reading(distance, delay=elapsed)
 
@@ -130,49 +130,6 @@ def ranges_of(stamp: int, distance: float, reach: tuple[float, float], delay: fl
         exposure=delay,
         delay=delay,
     )
-
-
-@contextmanager
-def opened_bus(bus: int | str, address: int) -> Iterator[maxbotix.Transfer]:
-    """Transfers with a chip on /dev/i2c-N, or on an emulator's socket; raises OSError when it cannot be opened."""
-    if isinstance(bus, str):
-        with socket.socket(socket.AF_UNIX) as client:
-            client.settimeout(2.0)
-            client.connect(bus)
-            yield partial(_over_socket, client, address)
-        return
-    try:
-        import smbus2
-    except ImportError as error:
-        raise DataflowError("smbus2 is not installed; it comes with `pip install caneflow[devices]`") from error
-    with smbus2.SMBus(bus) as opened:
-        yield partial(_over_bus, smbus2, opened, address)
-
-
-def _over_bus(smbus2: Any, bus: Any, address: int, written: bytes, length: int) -> bytes:
-    messages = [smbus2.i2c_msg.write(address, written)] if written else []
-    messages += [smbus2.i2c_msg.read(address, length)] if length else []
-    bus.i2c_rdwr(*messages)
-    return bytes(messages[-1]) if length else b""
-
-
-def _over_socket(client: socket.socket, address: int, written: bytes, length: int) -> bytes:
-    client.sendall(i2c_socket.Request(address, written, length).packed())
-    error, count = i2c_socket.ANSWER.unpack(_received(client, i2c_socket.ANSWER.size))
-    data = _received(client, count)
-    if error:
-        raise OSError(error, os.strerror(error))
-    return data
-
-
-def _received(client: socket.socket, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        piece = client.recv(count - len(data))
-        if not piece:
-            raise OSError("the emulator has gone")
-        data += piece
-    return data
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from caneflow.i2c_bus import serve_client
 from caneflow.messages import Ranges
 from caneflow.messages.rig import Rig
 from caneflow.protocols import i2c_socket, maxbotix
@@ -20,7 +21,7 @@ from caneflow.protocols.maxbotix import SerialWords, said, taken
 from caneflow.protocols.maxbotix_emulator import Echoes, I2cSonar, SerialSonar
 from caneflow.runtime import Context, Quiet
 from drivers.sonar import Sonar, SonarSettings, ranges_of
-from tools.emulate_mb1202 import nearest_of, serve_bus
+from tools.emulate_mb1202 import nearest_of
 
 ECHOES = Echoes([0.0, 1.0, 2.0], [1.23, 2.5, None])
 
@@ -125,8 +126,13 @@ def test_the_driver_reads_an_emulated_chip_over_its_socket(tmp_path: Path) -> No
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
         server.listen()
+
+        def transfer(address: int, written: bytes, length: int, time: float) -> bytes:
+            assert address == maxbotix.ADDRESS
+            return chip.transfer(written, length, time)
+
         # One second goes by with each transfer: nobody waits for the chip.
-        thread = threading.Thread(target=lambda: serve_bus(server.accept()[0], chip.transfer, lambda: next(clock)))
+        thread = threading.Thread(target=lambda: serve_client(server.accept()[0], transfer, lambda: next(clock)))
         thread.start()
         settings = SonarSettings(bus=str(path))
         context = Context(node="sonar", rig=Rig(), ports={"ranges": Ranges}, random=np.random.default_rng(1))
@@ -155,7 +161,10 @@ def test_a_clock_that_was_set_back_is_said_to_bring_nothing(monkeypatch: pytest.
 def test_a_bus_that_refuses_says_why_over_the_socket() -> None:
     mine, other = socket.socketpair()
     with mine, other:
-        thread = threading.Thread(target=lambda: serve_bus(other, I2cSonar(ECHOES).transfer, lambda: 0.0))
+        chip = I2cSonar(ECHOES)
+        thread = threading.Thread(
+            target=lambda: serve_client(other, lambda _, *rest: chip.transfer(*rest), lambda: 0.0)
+        )
         thread.start()
         mine.sendall(i2c_socket.Request(0x70, b"\x00", 0).packed())
         assert i2c_socket.ANSWER.unpack(mine.recv(3)) == (errno.EREMOTEIO, 0)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from caneflow.device_checks import a121, bno055, doppler_adc, mpu9250, p440, sonar, ti_mmwave
+from caneflow.device_checks import a121, bno055, doppler_adc, mpu9250, p440, sonar, ti_mmwave, vl53l5cx
 from caneflow.device_checks.samples import examine_samples
 from caneflow.errors import CaneflowError
 from caneflow.options import At, Keys
@@ -28,6 +28,7 @@ CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {
     "drivers.mpu9250": mpu9250.examine,
     "drivers.doppler_adc": doppler_adc.examine,
     "drivers.sonar": sonar.examine,
+    "drivers.vl53l5cx": vl53l5cx.examine,
     "drivers.a121": a121.examine,
     "drivers.ti_mmwave": ti_mmwave.examine,
 }

@@ -414,4 +414,5 @@ commands = {
     "a121": "emulate_a121",
     "ti_mmwave": "emulate_ti_mmwave",
     "mb1202": "emulate_mb1202",
+    "vl53l5cx": "emulate_vl53l5cx",
 }

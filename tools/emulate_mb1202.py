@@ -2,39 +2,25 @@
 
 import errno
 import os
-import select
-import signal
-import socket
-import stat
-import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from tempfile import gettempdir
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import typer
 
 from caneflow.errors import CaneflowError
+from caneflow.i2c_bus import EMULATED, serve
 from caneflow.messages import Ranges
-from caneflow.protocols import i2c_socket
 from caneflow.protocols.maxbotix import ADDRESS
 from caneflow.protocols.maxbotix_emulator import Echoes, I2cSonar
 from caneflow.recording import Recording
 
-BUS = Path(gettempdir()) / "caneflow-i2c"
-LONGEST_WAIT = 0.2  # s
-
-
-class Chip(Protocol):
-    """What sits on the bus."""
-
-    def __call__(self, written: bytes, length: int, time: float) -> bytes:
-        """One transfer; raises OSError when it is not acknowledged."""
-
 
 def command(
     recording: Annotated[Path, typer.Argument(metavar="REC", help="Recording.", show_default=False)],
-    bus: Annotated[Path, typer.Option(metavar="PATH", help="The Unix socket to make, in the place of a bus.")] = BUS,
+    bus: Annotated[
+        Path, typer.Option(metavar="PATH", help="The Unix socket to make, in the place of a bus.")
+    ] = EMULATED,
     stream: Annotated[
         str | None, typer.Option(metavar="NODE/PORT", help="Which ranges, where the recording has several.")
     ] = None,
@@ -47,21 +33,22 @@ def command(
     """
     echoes = echoes_of(recording, stream)
     chip = I2cSonar(echoes)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
-    if os.path.lexists(bus):
-        if not stat.S_ISSOCK(bus.lstat().st_mode):
-            raise CaneflowError(f"{bus}: exists and is not an emulator's socket; choose another name with --bus")
-        bus.unlink()  # of an emulator that was killed
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(bus))
-        server.listen()
-        print(f"MB1202 of {recording} on {bus}, address 0x{ADDRESS:02X}", flush=True)
-        try:
-            _serve(server, chip, echoes.end)
-            print("the recording is over", flush=True)
-        finally:
-            bus.unlink(missing_ok=True)
-            print(f"{chip.readings} readings", flush=True)
+
+    def transfer(address: int, written: bytes, length: int, time: float) -> bytes:
+        if address != ADDRESS:
+            raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+        return chip.transfer(written, length, time)
+
+    try:
+        serve(
+            bus,
+            f"MB1202 of {recording} on {bus}, address 0x{ADDRESS:02X}",
+            transfer,
+            echoes.end,
+            partial(print, flush=True),
+        )
+    finally:
+        print(f"{chip.readings} readings", flush=True)
 
 
 def echoes_of(recording: Path, stream: str | None) -> Echoes:
@@ -88,34 +75,3 @@ def nearest_of(reading: Ranges) -> float | None:
     """The nearest target (m) of all zones, as sound hears it; None: there is none."""
     seen = reading.ranges[(reading.status == 0) & (reading.ranges > 0)]
     return float(seen.min()) if len(seen) else None
-
-
-def serve_bus(client: socket.socket, transfer: Chip, now: Callable[[], float]) -> None:
-    """Answer one client's transfers until it leaves."""
-    with client, client.makefile("rb") as asked:
-        while len(head := asked.read(i2c_socket.REQUEST.size)) == i2c_socket.REQUEST.size:
-            address, count, length = i2c_socket.REQUEST.unpack(head)
-            written = asked.read(count)
-            try:
-                if address != ADDRESS:
-                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
-                answer = i2c_socket.answered(transfer(written, length, now()))
-            except OSError as error:
-                answer = i2c_socket.refused(error.errno or errno.EIO)
-            client.sendall(answer)
-
-
-def _serve(server: socket.socket, chip: I2cSonar, end: float) -> None:
-    """One client after the other, until the recording is over."""
-    begin: float | None = None
-
-    def now() -> float:
-        nonlocal begin
-        begin = time.monotonic() if begin is None else begin
-        if time.monotonic() - begin > end:
-            raise OSError(errno.ENXIO, os.strerror(errno.ENXIO))  # the chip has no power any more
-        return time.monotonic() - begin
-
-    while begin is None or time.monotonic() - begin <= end:
-        if select.select([server], [], [], LONGEST_WAIT)[0]:
-            serve_bus(server.accept()[0], chip.transfer, now)

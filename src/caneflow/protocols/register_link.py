@@ -102,9 +102,12 @@ class I2cLink(Link):
         now_ns: Callable[[], int],
         *,
         device: str = "BNO055",
+        register_bytes: int = 1,
     ) -> None:
+        """`register_bytes`: how long the number of a register is, high byte first."""
         super().__init__(device, pause, now_ns)
         self._transfer = transfer
+        self._register_bytes = register_bytes
 
     def write_unanswered(self, register: int, data: bytes) -> None:
         """Write what keeps the chip from answering."""
@@ -115,13 +118,13 @@ class I2cLink(Link):
 
     def _read(self, register: int, length: int) -> Received:
         began = self._now_ns()
-        data = self._transferred(bytes((register,)), length)
+        data = self._transferred(register.to_bytes(self._register_bytes, "big"), length)
         if len(data) != length:
             raise FailedError("short", f"the bus gave {len(data)} of {length} bytes")
         return Received(data, began)
 
     def _write(self, register: int, data: bytes) -> None:
-        self._transferred(bytes((register,)) + data, 0)
+        self._transferred(register.to_bytes(self._register_bytes, "big") + data, 0)
 
     def _transferred(self, data: bytes, length: int) -> bytes:
         try:
