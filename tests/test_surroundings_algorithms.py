@@ -88,6 +88,16 @@ def test_the_floors_reach_rises_at_once_and_falls_slowly() -> None:
     assert reach.reach > 1.9
 
 
+def test_before_the_first_step_the_walking_direction_follows_the_canes_yaw() -> None:
+    """Of a step of the yaw, 1 - exp(-t / 0.65 s) is there after t."""
+    direction = WalkingDirection()
+    for i in range(101):
+        direction.update(i * 10 * MS, 0.0, 0.0, 0.4)
+    for i in range(1, 66):
+        direction.update((100 + i) * 10 * MS, 0.0, 0.0, 1.0)
+    assert direction.heading == pytest.approx(1.0 - 0.6 * math.exp(-1.0))
+
+
 def test_the_walking_direction_is_the_chord_of_a_step_and_is_held_at_rest() -> None:
     direction = WalkingDirection()
     for i in range(100):  # standing: where the cane points, on average
