@@ -25,6 +25,7 @@ from caneflow.errors import not_installed
 from caneflow.messages import SAMPLES, MessageError, Sample, decode, stream_of
 from caneflow.messages.codec import fields_in
 from caneflow.messages.rig import Rig, overlaid, read_rig
+from caneflow.near_files import near_file
 from caneflow.printable import printable
 from caneflow.recording.columns import flat, structured
 from caneflow.recording.continuity import Continuity
@@ -139,7 +140,8 @@ class Recording:
         try:
             self._file = self.path.open("rb")
         except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be read: {error.strerror or error}") from error
+            why = f"{error.strerror or error}{near_file(self.path)}"
+            raise RecordingError(f"{self.path}: cannot be read: {why}") from error
         try:
             self._layout = _sound_layout(self.path, self._file)
             about = os.fstat(self._file.fileno())

@@ -15,6 +15,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
+from caneflow.near_files import near_file
 from caneflow.runtime.errors import DataflowError, Place, Problem
 from caneflow.runtime.wording import KeyPath, dotted, one_line, shown
 
@@ -90,7 +91,7 @@ def read_yaml(path: Path) -> Document:
             data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
         reason = getattr(error, "strerror", None) or error
-        raise _broken(Place(source=source), f"cannot be read: {reason}") from error
+        raise _broken(Place(source=source), f"cannot be read: {reason}{near_file(path)}") from error
     if data.startswith(MCAP):
         example = f"caneflow run dataflow.yaml --replay {source}"
         raise _broken(Place(source=source), f"a recording, not a dataflow; expected e.g. {example}")
