@@ -19,9 +19,9 @@ from caneflow.protocols import i2c_socket, maxbotix
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.maxbotix import SerialWords, said, taken
 from caneflow.protocols.maxbotix_emulator import Echoes, I2cSonar, SerialSonar
+from caneflow.recording.ranges_over_time import nearest_of
 from caneflow.runtime import Context, Quiet
 from drivers.sonar import Sonar, SonarSettings, ranges_of
-from tools.emulate_mb1202 import nearest_of
 
 ECHOES = Echoes([0.0, 1.0, 2.0], [1.23, 2.5, None])
 

@@ -4,12 +4,13 @@ import json
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 
-from caneflow.device_checks import a121, bno055, doppler_adc, mpu9250, p440, sonar, ti_mmwave, vl53l5cx
+from caneflow.device_checks import a121, bno055, doppler_adc, mpu9250, p440, sonar, ti_mmwave, tof
 from caneflow.device_checks.samples import examine_samples
 from caneflow.errors import CaneflowError
 from caneflow.options import At, Keys
@@ -28,7 +29,8 @@ CHECKS: dict[str, Callable[[Node], Iterator[Finding]]] = {
     "drivers.mpu9250": mpu9250.examine,
     "drivers.doppler_adc": doppler_adc.examine,
     "drivers.sonar": sonar.examine,
-    "drivers.vl53l5cx": vl53l5cx.examine,
+    "drivers.vl53l5cx": partial(tof.examine, tof.VL53L5CX),
+    "drivers.vl53l1x": partial(tof.examine, tof.VL53L1X),
     "drivers.a121": a121.examine,
     "drivers.ti_mmwave": ti_mmwave.examine,
 }

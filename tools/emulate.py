@@ -415,4 +415,5 @@ commands = {
     "ti_mmwave": "emulate_ti_mmwave",
     "mb1202": "emulate_mb1202",
     "vl53l5cx": "emulate_vl53l5cx",
+    "vl53l1x": "emulate_vl53l1x",
 }

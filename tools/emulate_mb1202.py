@@ -8,12 +8,10 @@ from typing import Annotated
 
 import typer
 
-from caneflow.errors import CaneflowError
 from caneflow.i2c_bus import EMULATED, serve
-from caneflow.messages import Ranges
 from caneflow.protocols.maxbotix import ADDRESS
-from caneflow.protocols.maxbotix_emulator import Echoes, I2cSonar
-from caneflow.recording import Recording
+from caneflow.protocols.maxbotix_emulator import I2cSonar
+from caneflow.recording.ranges_over_time import echoes_of
 
 
 def command(
@@ -49,29 +47,3 @@ def command(
         )
     finally:
         print(f"{chip.readings} readings", flush=True)
-
-
-def echoes_of(recording: Path, stream: str | None) -> Echoes:
-    """The nearest target over time of a stream of ranges, from the recording's first sample on."""
-    with Recording(recording) as opened:
-        there = {f"{found.node}/{found.port}": (found.node, found.port) for found in opened.streams_of(Ranges)}
-        if stream is None and len(there) == 1:
-            (stream,) = there
-        if stream not in there:
-            asked = f"no ranges {stream}" if stream else "choose one stream of ranges with --stream"
-            raise CaneflowError(f"{recording}: {asked}; there are {', '.join(there) or 'none'}")
-        span = opened.span()
-        assert span is not None  # the stream has a sample
-        times, distances = [], []
-        for found in opened.samples([there[stream]]):
-            reading = found.decoded()
-            assert isinstance(reading, Ranges)
-            times.append((found.stamp - span[0]) * 1e-9)
-            distances.append(nearest_of(reading))
-    return Echoes(times, distances)
-
-
-def nearest_of(reading: Ranges) -> float | None:
-    """The nearest target (m) of all zones, as sound hears it; None: there is none."""
-    seen = reading.ranges[(reading.status == 0) & (reading.ranges > 0)]
-    return float(seen.min()) if len(seen) else None

@@ -9,13 +9,12 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.i2c_bus import EMULATED, serve
-from caneflow.messages import Ranges
 from caneflow.protocols import vl53l5cx
 from caneflow.protocols.c_arrays import byte_arrays
 from caneflow.protocols.errors import ProtocolError
 from caneflow.protocols.vl53l5cx import Firmware
 from caneflow.protocols.vl53l5cx_emulator import Emulator, Scene, as_c_source, pretended_firmware
-from caneflow.recording import Recording
+from caneflow.recording.ranges_over_time import readings_of
 
 
 def command(
@@ -70,18 +69,10 @@ def firmware_of(given: Path | None, pretended: Path) -> Firmware:
 
 def scene_of(recording: Path, stream: str | None) -> Scene:
     """What a stream of 64 zones saw over time, from its first reading on."""
-    with Recording(recording) as opened:
-        there = {f"{found.node}/{found.port}": (found.node, found.port) for found in opened.streams_of(Ranges)}
-        if stream is None and len(there) == 1:
-            (stream,) = there
-        if stream not in there:
-            asked = f"no ranges {stream}" if stream else "choose one stream of ranges with --stream"
-            raise CaneflowError(f"{recording}: {asked}; there are {', '.join(there) or 'none'}")
-        readings = [found.decoded() for found in opened.samples([there[stream]])]
-    zones = {len(each.ranges) for each in readings if isinstance(each, Ranges)}
+    seen = readings_of(recording, stream)[1]
+    zones = {len(each.ranges) for each in seen}
     if zones != {vl53l5cx.ZONES}:
-        raise CaneflowError(f"{recording}: {stream} has {sorted(zones)} zones; a {vl53l5cx.NAME} has {vl53l5cx.ZONES}")
-    seen = [each for each in readings if isinstance(each, Ranges)]
+        raise CaneflowError(f"{recording}: readings of {sorted(zones)} zones; a {vl53l5cx.NAME} has {vl53l5cx.ZONES}")
     has_sigma = all(each.sigma is not None for each in seen)
     return Scene(
         times=[(each.stamp - seen[0].stamp) * 1e-9 for each in seen],
