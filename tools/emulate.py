@@ -416,4 +416,5 @@ commands = {
     "mb1202": "emulate_mb1202",
     "vl53l5cx": "emulate_vl53l5cx",
     "vl53l1x": "emulate_vl53l1x",
+    "drv2605": "emulate_drv2605",
 }
