@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caneflow.errors import CaneflowError
 from caneflow.i2c_bus import serve_client
 from caneflow.messages import Ranges
 from caneflow.messages.rig import Rig
@@ -24,6 +25,7 @@ from caneflow.protocols.vl53l5cx_emulator import Emulator, Scene, as_c_source, p
 from caneflow.runtime import Context
 from caneflow.runtime.errors import DataflowError
 from drivers.vl53l5cx import Vl53l5cx, Vl53l5cxSettings, opened, ranges_of, read_firmware
+from tools.emulate_vl53l5cx import firmware_of
 
 FIRMWARE = pretended_firmware()
 
@@ -218,3 +220,12 @@ def test_a_bus_that_is_not_there_is_an_error() -> None:
     with pytest.raises(OSError) as error, opened(Vl53l5cxSettings(bus="/nowhere/bus", firmware="x")):
         pass
     assert error.value.errno == errno.ENOENT
+
+
+def test_the_pretended_firmware_takes_the_place_of_no_other_file(tmp_path: Path) -> None:
+    pretended = tmp_path / "bus.h"
+    assert firmware_of(None, pretended) == firmware_of(None, pretended)  # its own may be there already
+    pretended.write_text("a header")
+    with pytest.raises(CaneflowError, match="already exists"):
+        firmware_of(None, pretended)
+    assert pretended.read_text() == "a header"

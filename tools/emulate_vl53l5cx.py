@@ -9,6 +9,7 @@ import typer
 
 from caneflow.errors import CaneflowError
 from caneflow.i2c_bus import EMULATED, serve
+from caneflow.outputs import require_free
 from caneflow.protocols import vl53l5cx
 from caneflow.protocols.c_arrays import byte_arrays
 from caneflow.protocols.errors import ProtocolError
@@ -57,7 +58,10 @@ def firmware_of(given: Path | None, pretended: Path) -> Firmware:
     """The firmware that the chip takes: ST's, or one that is written to `pretended` for the driver to read."""
     if given is None:
         made = pretended_firmware()
-        pretended.write_text(as_c_source(made))
+        source = as_c_source(made)
+        if not (pretended.is_file() and pretended.read_text(errors="replace") == source):  # of an emulator before
+            require_free(pretended)
+            pretended.write_text(source)
         return made
     try:
         return Firmware.of(byte_arrays(given.read_text(encoding="latin-1")))
