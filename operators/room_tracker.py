@@ -26,6 +26,7 @@ from caneflow.algorithms.inertial.standing import StandingDetector, StandingSett
 from caneflow.algorithms.quantities import Component, Length, Time, Zero
 from caneflow.algorithms.room.room_ekf import RoomEkf, RoomEkfSettings
 from caneflow.algorithms.room.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
+from caneflow.algorithms.room.room_sign_bank import RoomSignBank, SignBankSettings
 from caneflow.algorithms.room.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor, Vector2
 from caneflow.algorithms.rotations import Quaternion, from_yaw, rotate
 from caneflow.messages import DopplerTarget, Imu, MessageError, Pose, Sample
@@ -70,6 +71,7 @@ class RoomTrackerSettings:
     heading_particle: RoomParticleSettings = field(default_factory=RoomParticleSettings)
     ekf: RoomEkfSettings = field(default_factory=plain)
     best: RoomEkfSettings = field(default_factory=RoomEkfSettings)
+    signs: SignBankSettings = field(default_factory=SignBankSettings)  # of `best`, where a sensor tells none
 
 
 class RoomTrackerOperator(Operator):
@@ -85,7 +87,7 @@ class RoomTrackerOperator(Operator):
         self._settings = settings
         self._boresight = context.rig.boresight  # of the cane
         self._tracker = tracker(settings, context, names)
-        if CANE in context.ports and not isinstance(self._tracker, RoomEkf):
+        if CANE in context.ports and not isinstance(self._tracker, RoomEkf | RoomSignBank):
             raise MessageError(f"room_tracker: {settings.method} cannot use the cane; ekf and best can")
         self._heard_ns: dict[str, int | None] = dict.fromkeys(names)
         self._begin_ns: int | None = None  # stamp of the first sample
@@ -170,7 +172,7 @@ class RoomTrackerOperator(Operator):
 
     def _take_cane(self, pose: Pose) -> None:
         """The cane is ahead of the person, in the direction in which it points; a swing averages out."""
-        assert isinstance(self._tracker, RoomEkf)
+        assert isinstance(self._tracker, RoomEkf | RoomSignBank)
         cosine, sine = heading_of(pose.orientation, self._boresight)
         ahead = self._settings.cane_ahead
         place = self._cane_gate.update(pose.stamp, (pose.position[0] - ahead * cosine, pose.position[1] - ahead * sine))
@@ -228,7 +230,7 @@ def tracker(settings: RoomTrackerSettings, context: Context, names: list[str]) -
         case "ekf":
             return RoomEkf(settings.ekf, sensors, start)
         case "best":
-            return RoomEkf(settings.best, sensors, start)
+            return RoomSignBank(settings.best, sensors, start, settings.signs)
 
 
 def sensors_of(rig: Rig, names: list[str]) -> Mapping[str, StaticSensor]:

@@ -35,14 +35,14 @@ def told(state: Floats, what: str, sensor: str) -> tuple[Floats, float]:
     """Derivative and residual of one kind of measurement at a state."""
     start = RoomStart(guess=(5.0, 3.0))
     looking: Any = Looking(replace(RoomEkfSettings(), use_heading=False), SENSORS, start)
-    looking._state = state
+    looking.state = state
     if what == "strength":
         looking._take_strength(sensor, -20.0)
     elif what == "range":
         looking._take_range(SENSORS[sensor], 4.0)
     else:
         echo = Echo(stamp_ns=1, valid=True, range_rate=0.3)
-        looking._take_speed(SENSORS[sensor], echo)
+        looking.take_speed(sensor, echo)
     h, residual = looking.seen
     return h, residual
 

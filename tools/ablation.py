@@ -23,6 +23,7 @@ from caneflow.algorithms.radar.doppler_spectrum import DopplerSpectrum, DopplerS
 from caneflow.algorithms.room.room_calibration import CalibrationSettings, counting, hops_over, range_calibration, sight
 from caneflow.algorithms.room.room_ekf import RoomEkf, RoomEkfSettings
 from caneflow.algorithms.room.room_particles import HeadingParticleTracker, ParticleTracker, RoomParticleSettings
+from caneflow.algorithms.room.room_sign_bank import RoomSignBank
 from caneflow.algorithms.room.room_tracking import Echo, RoomStart, RoomTracker, StaticSensor
 from caneflow.algorithms.rotations import rotate
 from caneflow.errors import CaneflowError
@@ -62,6 +63,10 @@ def _filter(settings: RoomEkfSettings) -> Make:
     return lambda sensors, start: RoomEkf(settings, sensors, start)
 
 
+def _bank(settings: RoomEkfSettings) -> Make:
+    return lambda sensors, start: RoomSignBank(settings, sensors, start)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Variant:
     """One method with some of its measurements."""
@@ -78,8 +83,8 @@ VARIANTS = {
     "everything": Variant(title="velocity, range, IMU: Algorithm 1", make=_particle(), paper="0.4 / 0.9"),
     "heading_particle": Variant(title="`heading_particle`, IMU", make=_heading_particle),
     "ekf": Variant(title="`ekf`, IMU", make=_filter(RoomEkfSettings(bias_error=0.0))),
-    "best": Variant(title="`best`, IMU", make=_filter(RoomEkfSettings())),
-    "best_alone": Variant(title="`best` without IMU", make=_filter(RoomEkfSettings(use_heading=False))),
+    "best": Variant(title="`best`, IMU", make=_bank(RoomEkfSettings())),
+    "best_alone": Variant(title="`best` without IMU", make=_bank(RoomEkfSettings(use_heading=False))),
 }
 FOUR = "best_four"  # `best` and IMU with four sensors
 FOUR_TITLE = "`best`, IMU, four sensors"

@@ -79,6 +79,7 @@ class RoomEkfSettings:
     reference_range: Length = 6.0  # m, where k is right whatever gamma
     range_error: Factor = 0.1  # m, of sensors that measure it
     edge_error: Length = 1.0  # m, sd of how far beyond the area's edge someone may be
+    edge_share: Fraction | Zero = 0.05  # of what being beyond it says against a member of a bank, per echo
     degrees: DegreesOfFreedom = 4.0  # of freedom of the Student-t that all errors are taken to have
     gate: Annotated[float, Gt(1), Le(1000)] = 5.0  # sd beyond which a measurement is discarded
     way_noise: Density = 0.1  # m/sqrt(s), of dead reckoning
@@ -115,10 +116,11 @@ class RoomEkf:
         self._crossed_ns: int | None = None  # when the heading was last used
         self._held = False  # whether the person did not move, the last time
         self.discarded = 0
+        self.log_likelihood = 0.0  # of all that was measured, up to a constant: what a bank weighs its members by
         size = BIASES + len(self._sensors)
-        self._state = np.zeros(size)
-        self._state[:2], error = start.moments()
-        self._state[GAMMA] = settings.gamma
+        self.state = np.zeros(size)
+        self.state[:2], error = start.moments()
+        self.state[GAMMA] = settings.gamma
         spread = np.full(size, settings.bias_error)
         spread[:BIASES] = (
             *error,
@@ -127,7 +129,7 @@ class RoomEkf:
             settings.yaw_error,
             settings.gamma_error,
         )
-        self._covariance = np.diag(spread**2)
+        self.covariance = np.diag(spread**2)
 
     @property
     def moving(self) -> bool:
@@ -146,22 +148,30 @@ class RoomEkf:
 
     def echo(self, sensor: str, echo: Echo) -> None:
         """Take what a sensor saw."""
+        self.count(echo)
+        if self.take_place(sensor, echo):
+            self.take_speed(sensor, echo)
+
+    def count(self, echo: Echo) -> None:
+        """Take whether anything moves; members of a bank share what is known of it."""
         self._motion.echo(echo.stamp_ns, echo.valid)
+
+    def take_place(self, sensor: str, echo: Echo) -> bool:
+        """Go on to the time of an echo and take what it says of the place; whether it says anything of the speed."""
         self._advance(echo.stamp_ns)
         if not echo.valid:
-            return
+            return False
         if echo.range is not None:
             self._take_range(self._sensors[sensor], echo.range)
         if self._motion.standing(echo.stamp_ns):  # a limb, a sway, or noise
-            return
+            return False
         if self._settings.use_strength and echo.strength is not None:
             self._take_strength(sensor, echo.strength)
-        if self._settings.use_speed:
-            self._take_speed(self._sensors[sensor], echo)
+        return self._settings.use_speed
 
     def estimate(self, stamp_ns: int) -> RoomEstimate:
         """The state, predicted to `stamp_ns`."""
-        state, covariance = self._state, self._covariance
+        state, covariance = self.state, self.covariance
         if self._now_ns is not None and stamp_ns > self._now_ns:
             state, covariance = self._predicted(stamp_ns, self._motion.moving(stamp_ns))
         return RoomEstimate(
@@ -175,7 +185,7 @@ class RoomEkf:
         if stamp_ns <= self._now_ns:
             return
         moving = self._motion.moving(stamp_ns)
-        self._state, self._covariance = self._predicted(stamp_ns, moving)
+        self.state, self.covariance = self._predicted(stamp_ns, moving)
         self._now_ns = stamp_ns
         if moving and self._heading_known(stamp_ns) and not self._way_known(stamp_ns):
             if self._held:
@@ -194,7 +204,7 @@ class RoomEkf:
         assert self._now_ns is not None
         s = self._settings
         dt = (stamp_ns - self._now_ns) * 1e-9
-        size = len(self._state)
+        size = len(self.state)
         f, q, drift = np.eye(size), np.zeros((size, size)), np.zeros(size)
         if self._way_known(stamp_ns):
             self._go_the_way(stamp_ns, dt, f, q, drift)
@@ -213,7 +223,7 @@ class RoomEkf:
         for place in self._place.values():
             f[place, place] = keep
             q[place, place] = (1.0 - keep**2) * s.bias_error**2
-        return f @ self._state + drift, f @ self._covariance @ f.T + q
+        return f @ self.state + drift, f @ self.covariance @ f.T + q
 
     def _hold(self, dt: float, f: Array, q: Array) -> None:
         """Nothing moves, or nobody sees it: the velocity dies away, the position may creep."""
@@ -244,10 +254,10 @@ class RoomEkf:
         f[X, U], f[X, V], f[Y, U], f[Y, V] = along, -aside, aside, along
         c, n = decay * math.cos(travel.turned), decay * math.sin(travel.turned)
         f[U, U], f[U, V], f[V, U], f[V, V] = c, -n, n, c
-        yaw = travel.yaw + float(self._state[BETA])
+        yaw = travel.yaw + float(self.state[BETA])
         c, n = math.cos(yaw), math.sin(yaw)
         gained = (1.0 - decay) * s.usual_speed
-        drift[U], drift[V] = gained * (c + n * self._state[BETA]), gained * (n - c * self._state[BETA])
+        drift[U], drift[V] = gained * (c + n * self.state[BETA]), gained * (n - c * self.state[BETA])
         f[U, BETA], f[V, BETA] = -gained * n, gained * c
         a, b = s.along_noise**2 * dt, s.across_noise**2 * dt
         q[U, U], q[V, V] = a * c * c + b * n * n, a * n * n + b * c * c
@@ -258,7 +268,7 @@ class RoomEkf:
         """With dead reckoning: its way and its velocity, turned by beta."""
         assert self._now_ns is not None
         s = self._settings
-        beta = float(self._state[BETA])
+        beta = float(self.state[BETA])
         c, n = math.cos(beta), math.sin(beta)
         f[U, U] = f[V, V] = 0.0
         east, north = self._way.between(self._now_ns, stamp_ns)
@@ -273,27 +283,27 @@ class RoomEkf:
     def _set_off(self, stamp_ns: int) -> None:
         """Whoever walks again walks ahead: what was left of the velocity says nothing, and its sign may be wrong."""
         s = self._settings
-        yaw = self._headings.travel(stamp_ns, stamp_ns).yaw + float(self._state[BETA])
+        yaw = self._headings.travel(stamp_ns, stamp_ns).yaw + float(self.state[BETA])
         c, n = math.cos(yaw), math.sin(yaw)
-        self._state[U], self._state[V] = s.set_off_speed * c, s.set_off_speed * n
+        self.state[U], self.state[V] = s.set_off_speed * c, s.set_off_speed * n
         a, b = s.set_off_error**2, s.across_speed**2
-        self._covariance[[U, V], :] = self._covariance[:, [U, V]] = 0.0
-        self._covariance[U, U], self._covariance[V, V] = a * c * c + b * n * n, a * n * n + b * c * c
-        self._covariance[U, V] = self._covariance[V, U] = (a - b) * c * n
+        self.covariance[[U, V], :] = self.covariance[:, [U, V]] = 0.0
+        self.covariance[U, U], self.covariance[V, V] = a * c * c + b * n * n, a * n * n + b * c * c
+        self.covariance[U, V] = self.covariance[V, U] = (a - b) * c * n
 
     def _take_heading(self, stamp_ns: int) -> None:
         """The velocity is along the heading: what it has across is 0, and what it has along is not negative."""
         dt = 0.05 if self._crossed_ns is None else (stamp_ns - self._crossed_ns) * 1e-9
         self._crossed_ns = stamp_ns
-        yaw = self._headings.travel(stamp_ns, stamp_ns).yaw + float(self._state[BETA])
+        yaw = self._headings.travel(stamp_ns, stamp_ns).yaw + float(self.state[BETA])
         c, n = math.cos(yaw), math.sin(yaw)
-        u, v = float(self._state[U]), float(self._state[V])
+        u, v = float(self.state[U]), float(self.state[V])
         # one measurement of this error per 0.25 s, however often it is made
         noise = self._settings.across_speed**2 * 0.25 / max(dt, 1e-3)
-        h = np.zeros(len(self._state))
+        h = np.zeros(len(self.state))
         h[U], h[V], h[BETA] = -n, c, -(c * u + n * v)
         self._correct(h, n * u - c * v, noise)
-        along = c * float(self._state[U]) + n * float(self._state[V])
+        along = c * float(self.state[U]) + n * float(self.state[V])
         if along < 0.0:  # nobody walks backwards for long; and the sensors' mirror image is walked in just so
             h[U], h[V], h[BETA] = c, n, c * v - n * u
             self._correct(h, -along, noise)
@@ -303,22 +313,24 @@ class RoomEkf:
         if self._area is None:
             return
         for place, low, high in ((X, self._area[0], self._area[1]), (Y, self._area[2], self._area[3])):
-            at = float(self._state[place])
+            at = float(self.state[place])
             beyond = min(at - low, 0.0) + max(at - high, 0.0)
             if beyond:
-                h = np.zeros(len(self._state))
+                variance = self._settings.edge_error**2 + float(self.covariance[place, place])
+                self.log_likelihood -= self._settings.edge_share * 0.5 * beyond**2 / variance
+                h = np.zeros(len(self.state))
                 h[place] = 1.0
                 self._correct(h, -beyond, self._settings.edge_error**2)
 
     def _sight(self, sensor: StaticSensor) -> tuple[float, float, float]:
         """Distance to the person, and the direction to them."""
-        dx, dy = float(self._state[X]) - sensor.position[0], float(self._state[Y]) - sensor.position[1]
+        dx, dy = float(self.state[X]) - sensor.position[0], float(self.state[Y]) - sensor.position[1]
         distance = max(math.hypot(dx, dy), LEAST_DISTANCE)
         return distance, dx / distance, dy / distance
 
     def _take_range(self, sensor: StaticSensor, measured: float) -> None:
         distance, ex, ey = self._sight(sensor)
-        h = np.zeros(len(self._state))
+        h = np.zeros(len(self.state))
         h[X], h[Y] = ex, ey
         self._correct_robustly(h, measured - distance, self._settings.range_error**2)
 
@@ -329,36 +341,37 @@ class RoomEkf:
             return
         distance, ex, ey = self._sight(sensor)
         off = math.remainder(math.atan2(ey, ex) - sensor.azimuth, math.tau)
-        gamma = float(self._state[GAMMA])
+        gamma = float(self.state[GAMMA])
         ratio = DECIBEL * math.log(distance / s.reference_range)
         expected = (
             DECIBEL * math.log(sensor.k)
             - 4.0 * DECIBEL * math.log(distance)
             - pattern_loss(off)
             + gamma * ratio
-            + float(self._state[self._place[name]])
+            + float(self.state[self._place[name]])
         )
         slope = (gamma - 4.0) * DECIBEL / distance
         turn = -2.0 * DECIBEL * math.tan(min(max(off, -1.3), 1.3)) / distance
-        h = np.zeros(len(self._state))
+        h = np.zeros(len(self.state))
         h[X], h[Y] = slope * ex - turn * ey, slope * ey + turn * ex
         h[GAMMA] = ratio
         h[self._place[name]] = 1.0
         self._correct_robustly(h, measured - expected, s.strength_error**2 / s.strength_share)
 
-    def _take_speed(self, sensor: StaticSensor, echo: Echo) -> None:
-        s = self._settings
+    def take_speed(self, name: str, echo: Echo) -> None:
+        """Take the radial speed that a sensor saw; of an unsigned one both signs as far as they are likely."""
+        s, sensor = self._settings, self._sensors[name]
         distance, ex, ey = self._sight(sensor)
-        u, v = float(self._state[U]), float(self._state[V])
+        u, v = float(self.state[U]), float(self.state[V])
         expected = u * ex + v * ey
-        h = np.zeros(len(self._state))
+        h = np.zeros(len(self.state))
         h[U], h[V] = ex, ey
         h[X], h[Y] = (u - expected * ex) / distance, (v - expected * ey) / distance
         noise = s.speed_error**2 / s.speed_share
         if echo.signed:
             self._correct_robustly(h, echo.range_rate - expected, noise)
             return
-        variance = float(h @ self._covariance @ h) + noise
+        variance = float(h @ self.covariance @ h) + noise
         away, towards = echo.range_rate - expected, -echo.range_rate - expected
         if min(abs(away), abs(towards)) > s.gate * math.sqrt(variance):  # their mean may fit where neither does
             self.discarded += 1
@@ -371,19 +384,21 @@ class RoomEkf:
 
     def _correct_robustly(self, h: Array, residual: float, noise: float, spread: float = 0.0) -> None:
         """Student-t: the larger the residual, the less it is believed; none at all beyond the gate."""
-        variance = float(h @ self._covariance @ h) + noise
+        variance = float(h @ self.covariance @ h) + noise
         normalized = residual / math.sqrt(variance)
-        if abs(normalized) > self._settings.gate:
+        nu = self._settings.degrees
+        if abs(normalized) > self._settings.gate:  # the same for all members of a bank, however wide
+            self.log_likelihood -= 0.5 * (nu + 1.0) * math.log1p(self._settings.gate**2 / nu)
             self.discarded += 1
             return
-        nu = self._settings.degrees
+        self.log_likelihood -= 0.5 * (math.log(variance) + (nu + 1.0) * math.log1p(normalized**2 / nu))
         noise *= max((nu + normalized**2) / (nu + 1.0), 1.0)
         self._correct(h, residual, noise, spread)
 
     def _correct(self, h: Array, residual: float, noise: float, spread: float = 0.0) -> None:
-        ph = self._covariance @ h
+        ph = self.covariance @ h
         variance = float(h @ ph) + noise
         gain = ph / variance
-        self._state = self._state + gain * residual
+        self.state = self.state + gain * residual
         # P - K S K' is symmetric by construction; `spread` is what the choice between two signs leaves open
-        self._covariance = self._covariance - np.outer(gain, gain) * (variance - spread)
+        self.covariance = self.covariance - np.outer(gain, gain) * (variance - spread)
