@@ -50,13 +50,17 @@ def times_of(scans: tuple[Scan, ...]) -> np.ndarray:
     return np.array([s.timestamp_ms - scans[0].timestamp_ms for s in scans]) / 1e3
 
 
-def tracked_ranges(times: np.ndarray) -> np.ndarray:
-    """Optical ranges (m) of the reflectors at radar `times`, shape (reflectors, len(times))."""
+def tracked_places(at: np.ndarray) -> np.ndarray:
+    """Places (m, optical frame) of the radar at optical times `at` (s), shape (len(at), 3)."""
     with (RAIL / "group6_trial_008.csv").open(newline="") as file:
         rows = [row for row in csv.reader(file) if row and row[0].isdigit() and all(row[5:9])]
     optical = np.array([[float(row[1]), *map(float, row[6:9])] for row in rows])
-    at = times + CLOCK_SHIFT
-    radar = np.stack([np.interp(at, optical[:, 0], optical[:, 1 + axis]) for axis in range(3)], axis=1)
+    return np.stack([np.interp(at, optical[:, 0], optical[:, 1 + axis]) for axis in range(3)], axis=1)
+
+
+def tracked_ranges(times: np.ndarray) -> np.ndarray:
+    """Optical ranges (m) of the reflectors at radar `times`, shape (reflectors, len(times))."""
+    radar = tracked_places(times + CLOCK_SHIFT)
     return np.stack([np.linalg.norm(radar - reflector, axis=1) for reflector in REFLECTORS])
 
 
