@@ -32,7 +32,7 @@ def test_two_things_are_where_profiles_from_many_places_cross() -> None:
     for thing in things:
         assert min(math.dist(thing, (peak.x, peak.y)) for peak in found) < 0.1
     grid.clear()
-    assert grid.peaks(1, 0.5)[0].count == 0
+    assert grid.peaks(1, 0.5)[0].counts == 0
 
 
 def test_a_radar_above_sees_a_thing_at_its_slant_range() -> None:

@@ -21,15 +21,15 @@ class Peak(NamedTuple):
 
     x: float  # m
     y: float
-    count: int
+    counts: int
 
 
 class ProfileMap:
     """Cells of `cell` m from (x0, y0) on, `shape` of them."""
 
     def __init__(self, x0: float, y0: float, cell: float, shape: tuple[int, int]) -> None:
-        self.x: Floats = x0 + (np.arange(shape[0]) + 0.5) * cell
-        self.y: Floats = y0 + (np.arange(shape[1]) + 0.5) * cell
+        self.x: Floats = x0 + (np.arange(shape[0], dtype=np.float64) + 0.5) * cell
+        self.y: Floats = y0 + (np.arange(shape[1], dtype=np.float64) + 0.5) * cell
         self.counts: Counts = np.zeros(shape, np.int32)
 
     def clear(self) -> None:
