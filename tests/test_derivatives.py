@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings
+from caneflow.algorithms.cane.cane_filter import CaneFilter, CaneFilterSettings, _Pointing
 from caneflow.algorithms.cane.heading_hypotheses import HeadingHypotheses, HeadingSettings
 from caneflow.algorithms.imu_reading import ImuReading
 from caneflow.algorithms.room.room_ekf import RoomEkf, RoomEkfSettings
@@ -112,3 +112,29 @@ def test_the_angle_between_where_a_cane_points_and_its_bearer_walks_is_learnt(be
         cane.imu(stamp_ns, reading)
         cane.velocity(stamp_ns, (math.cos(beta), math.sin(beta)), (1e-4, 0.0, 1e-4), 0.0)
     assert cane._motion.pointing == pytest.approx(beta, abs=0.02)
+
+
+@pytest.mark.parametrize("after", [0.05, 5.0, 3600.0])
+def test_what_wanders_about_zero_stays_as_uncertain_as_it_is_when_nothing_is_seen(after: float) -> None:
+    """The yaw's error and each sensor's error of strength are of first order: q = (1 - f^2) s^2 keeps s^2."""
+    settings = RoomEkfSettings()
+    tracker: Any = RoomEkf(settings, SENSORS, RoomStart(guess=(5.0, 3.0)))
+    variances = [settings.yaw_error**2, *[settings.bias_error**2] * len(SENSORS)]
+    places = [4, *(tracker._place[name] for name in SENSORS)]  # see STATE
+    for place, variance in zip(places, variances, strict=True):
+        tracker.covariance[place, place] = variance
+    tracker._now_ns = 0
+    _, covariance = tracker._predicted(round(after * 1e9), moving=False)
+    assert covariance[places, places].tolist() == pytest.approx(variances)
+
+
+def test_a_cane_that_turns_through_south_turns_by_what_it_turned() -> None:
+    """Yaw goes from pi to -pi; the mean yaw follows at its rate, the mean square of the rate is that."""
+    pointing: Any = _Pointing(memory=1.0)
+    rate = 0.5  # rad/s
+    for index in range(2000):
+        yaw = math.remainder(rate * 0.01 * index, 2 * math.pi)
+        assert index == 0 or pointing.update(0.01, yaw) == pytest.approx(rate * 0.01)
+        pointing.update(0.0, yaw)
+    assert pointing.rate == pytest.approx(rate, rel=1e-3)
+    assert pointing.turning == pytest.approx(rate**2, rel=1e-3)

@@ -87,3 +87,11 @@ def test_the_edge_of_ground_in_a_beam_lies_about_0_8_cells_beyond_its_fastest_li
     cells = np.linspace(-2, 3, 1001)
     power = (one_way**2 * hann_power(cells[:, None] - lines)).sum(axis=1)
     assert steepest_fall(cells, np.sqrt(power)) == pytest.approx(EDGE_BEYOND_SPEED, abs=0.07)
+
+
+@pytest.mark.parametrize("at_the_left", [True, False])
+def test_a_fall_at_the_rim_that_is_steeper_moves_the_edge_half_a_column_towards_it(at_the_left: bool) -> None:
+    """The steepest of those looked at is beside the rim: the true one lies beyond it, on that side."""
+    row = np.array([[20.0, 10.0, 7.0, 6.5, 6.0, 5.6, 5.3, 5.0]])  # falls 10, 3, 0.5 ...: column 0 is not looked at
+    edge = superior_edges(row if at_the_left else 20.0 - row[:, ::-1])[0][0]
+    assert edge == (1.5 - 0.5 if at_the_left else 5.5 + 0.5)

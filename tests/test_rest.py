@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caneflow.algorithms.radar.range_doppler import hann, range_doppler_map
-from caneflow.algorithms.radar.rest import RestSettings, ground_stands, is_at_rest, peaks_and_floor
+from caneflow.algorithms.radar.rest import STANDING_CELLS, RestSettings, ground_stands, is_at_rest, peaks_and_floor
 
 SETTINGS = RestSettings()
 STILL = 0.01  # rad/s
@@ -108,3 +108,15 @@ def test_noise_alone_hardly_ever_passes_for_ground_that_stands() -> None:
         picture = np.repeat(0.01 * rng.exponential(size=6), 3)
         taken += ground_stands(picture, 1.0, 0.01, SETTINGS.least_standing)
     assert taken == 0
+
+
+@pytest.mark.parametrize("cell", [1.0, 2.0, 3.5])
+def test_what_is_slower_than_the_standing_cells_is_on_neither_side(cell: float) -> None:
+    """A line in each bin of a spectrum in turn: the bins from -(standing - 1) to standing - 1 stand, for both sides."""
+    length, standing = 64, math.ceil(STANDING_CELLS * cell)
+    for at in range(length):
+        power = np.zeros(length)
+        power[at] = 1.0
+        signed = at if at < length // 2 else at - length
+        approaching, receding, floor = peaks_and_floor(power, cell)
+        assert (approaching, receding, floor) == (float(signed >= standing), float(signed <= -standing), 0.0), signed
