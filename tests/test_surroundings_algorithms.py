@@ -25,7 +25,6 @@ from caneflow.algorithms.surroundings.nearest_obstacles import (
 from caneflow.algorithms.surroundings.occupancy_grid import GridSettings, OccupancyGrid
 from caneflow.algorithms.surroundings.sensor_rays import Placed, PoseTrack, slerp, world_directions, zone_directions
 from caneflow.algorithms.surroundings.stream_watch import StreamWatch
-from caneflow.algorithms.surroundings.swing_centre import SwingCentre
 from caneflow.algorithms.surroundings.walking_direction import WalkingDirection
 
 MS = 1_000_000  # ns
@@ -114,54 +113,6 @@ def test_the_walking_direction_is_the_chord_of_a_step_and_is_held_at_rest() -> N
         direction.update((200 + i) * 10 * MS, way * math.cos(2.0), way * math.sin(2.0), 0.4)
     assert not direction.walking
     assert direction.heading == pytest.approx(2.0), "after the first step it is held"
-
-
-def swung(i: int, *, rate: float = 0.0, hertz: float = 0.83) -> float:
-    """Yaw of a cane that swings by 20 degrees to each side of 0.5 rad, at i times 10 ms."""
-    return 0.5 + rate * 0.01 * i + math.radians(20) * math.sin(math.tau * hertz * 0.01 * i)
-
-
-@pytest.mark.parametrize("hertz", [0.6, 0.83, 1.07])
-@pytest.mark.parametrize("rate", [0.0, 0.4, -0.4])
-def test_the_middle_of_the_swing_is_found_at_any_phase(hertz: float, rate: float) -> None:
-    swing, off = SwingCentre(), []
-    for i in range(500):
-        swing.update(i * 10 * MS, swung(i, rate=rate, hertz=hertz))
-        if i < 120:
-            assert swing.centre is None
-        else:
-            assert swing.centre is not None
-            off.append(swing.centre.yaw - (0.5 + rate * 0.01 * i))
-    assert max(map(abs, off)) < math.radians(3), "the 20 degrees of the swing itself are gone"
-
-
-def test_the_middle_of_the_swing_begins_again_after_a_gap_and_goes_on_over_the_turn_of_the_circle() -> None:
-    swing = SwingCentre()
-    for i in range(300):
-        swing.update(i * 10 * MS, math.remainder(math.pi + swung(i) - 0.5, math.tau))
-    assert swing.centre is not None
-    assert math.remainder(swing.centre.yaw - math.pi, math.tau) == pytest.approx(0.0, abs=math.radians(3))
-    swing.update(4000 * MS, 0.0)
-    assert swing.centre is None
-
-
-def walked(sideways: float, *, seconds: int = 1, speed: float = 0.8) -> float:
-    """By how much (rad) the direction is off after 10 s straight on and some with a false speed to the left, m/s."""
-    direction, y = WalkingDirection(), 0.0
-    for i in range(1000 + 100 * seconds):
-        y += 0.01 * sideways * (i >= 1000)
-        direction.update(i * 10 * MS, 0.01 * speed * i, y, swung(i))
-    return direction.heading
-
-
-def test_a_false_speed_across_the_way_turns_the_direction_by_less_than_half_of_what_it_turns_the_chord() -> None:
-    chord = math.atan2(0.1, 0.8)
-    assert walked(0.0) == pytest.approx(0.0, abs=math.radians(3)), "the grip of 0.5 rad is learnt"
-    assert 0.0 < walked(0.1) - walked(0.0) < 0.6 * chord
-
-
-def test_who_steps_sideways_without_turning_goes_where_the_chord_says() -> None:
-    assert walked(0.8) == pytest.approx(math.radians(45), abs=1e-6)
 
 
 def standing_at(cells: list[tuple[float, float, int]], view: View, updates: int = 2) -> NearestObstacles:
