@@ -65,6 +65,13 @@ def test_a_pulse_that_the_samples_cannot_hold_is_refused(step: float, carrier: f
         AnalyticSignal(bins=96, range_step=step, carrier=carrier, bandwidth=1e9)
 
 
+def test_a_carrier_beyond_what_the_samples_hold_is_refused_though_the_band_reaches_in() -> None:
+    highest = float(fast_time_frequencies(96, STEP)[-1])
+    AnalyticSignal(bins=96, range_step=STEP, carrier=0.99 * highest, bandwidth=BANDWIDTH)
+    with pytest.raises(ValueError, match="does not show in 96 samples"):
+        AnalyticSignal(bins=96, range_step=STEP, carrier=highest, bandwidth=BANDWIDTH)
+
+
 def test_with_soft_ends_a_strong_echo_does_not_ring() -> None:
     """Half a metre off the sharp band rings at -35 dB or more; softened it is 30 dB below that."""
     bins = 288
