@@ -28,6 +28,7 @@ from caneflow.runtime.hosts.process.events import (
 )
 from caneflow.runtime.hosts.process.group_recovery import AnyRecovery, recoveries
 from caneflow.runtime.hosts.process.inputs import Inputs, look_period
+from caneflow.runtime.hosts.process.last_events import take_the_rest
 from caneflow.runtime.hosts.process.local_sources import LocalSources
 from caneflow.runtime.hosts.process.outputs import Outputs
 from caneflow.runtime.hosts.process.quickness import Quickness
@@ -110,9 +111,7 @@ class Process:
             self.keep_snapshots()
         if self.group.feeds:
             self.local.threads.stop()
-            self.take_events(timeout=0)  # what they brought last
-            with self.lock:
-                self.handle_what_is_due()
+        take_the_rest(self.take_events, self._handle_unless_broken, replay=self.plan.replay)
 
     def at(self) -> str | None:
         """The sample that is being handled, or was last; None: the process has not begun."""
@@ -310,6 +309,11 @@ class Process:
     def now(self) -> int | None:
         """The clock (ns) by which samples may be too old; a replay has none."""
         return None if self.plan.replay else time.time_ns()
+
+    def _handle_unless_broken(self) -> bool:
+        with self.lock:
+            self.raise_if_broken()
+            return self.handle_what_is_due()
 
     def ask_for_missing(self) -> None:
         """Ask for samples that were sent by other processes and have not come."""
