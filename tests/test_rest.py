@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from caneflow.algorithms.radar.range_doppler import hann, range_doppler_map
-from caneflow.algorithms.radar.rest import STANDING_CELLS, RestSettings, ground_stands, is_at_rest, peaks_and_floor
+from caneflow.algorithms.radar.rest import (
+    STANDING_CELLS,
+    RestSettings,
+    ground_stands,
+    is_at_rest,
+    median,
+    peaks_and_floor,
+)
 
 SETTINGS = RestSettings()
 STILL = 0.01  # rad/s
@@ -120,3 +127,14 @@ def test_what_is_slower_than_the_standing_cells_is_on_neither_side(cell: float) 
         signed = at if at < length // 2 else at - length
         approaching, receding, floor = peaks_and_floor(power, cell)
         assert (approaching, receding, floor) == (float(signed >= standing), float(signed <= -standing), 0.0), signed
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 17, 18, 64])
+def test_the_median_is_numpys_to_the_last_bit(kind: type[np.floating], count: int) -> None:
+    rng = np.random.default_rng(count)
+    for _ in range(100):
+        values = rng.lognormal(sigma=5.0, size=count).astype(kind)
+        assert median(values) == float(np.median(values))
+    values[-1] = math.nan
+    assert math.isnan(median(values))

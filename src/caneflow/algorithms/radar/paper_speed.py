@@ -20,7 +20,7 @@ from caneflow.algorithms.radar.edges import EDGE_BEYOND_SPEED, superior_edges
 from caneflow.algorithms.radar.footprint import NO_RAYS, CaneGeometry, Fan, RayCaster, Rays, antenna_height, pitch
 from caneflow.algorithms.radar.moving_returns import MovingReturns, RadarParameters
 from caneflow.algorithms.radar.range_doppler import SlowTimeWindow, hann, speed_per_bin
-from caneflow.algorithms.radar.rest import RestSettings, ground_stands, is_at_rest, peaks_and_floor
+from caneflow.algorithms.radar.rest import RestSettings, ground_stands, is_at_rest, median, peaks_and_floor
 from caneflow.algorithms.rotations import Quaternion
 
 RECEDING_SHARE = 0.25  # of the approaching peak: with a beam of 50 deg, walking and swinging stay below it
@@ -183,7 +183,7 @@ class PaperSpeed:
         per_scan = np.add.reduce(moving.real**2 + moving.imag**2, axis=1) / len(rays.rows)
         return ground_stands(
             standing.real**2 + standing.imag**2,
-            float(np.median(per_scan)),  # not the mean: in the last of them the cane may have set off
+            median(per_scan),  # not the mean: in the last of them the cane may have set off
             returns.standing.noise_share,
             self._settings.rest.least_standing,
         )

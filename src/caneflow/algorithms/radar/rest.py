@@ -81,4 +81,19 @@ def ground_stands(standing: NDArray[np.floating], rest: float, noise_share: floa
     Half of them: the cane's own tip stands still in the radar's frame while it walks, but fills few cells. Ground that
     passes is not in the mean: at 0.1 m/s it has 2 % of its power there, at 1 m/s nothing.
     """
-    return rest > 0.0 and float(np.median(standing)) > (least + NOISE_MARGIN * noise_share) * rest
+    return rest > 0.0 and median(standing) > (least + NOISE_MARGIN * noise_share) * rest
+
+
+def median(values: NDArray[np.floating]) -> float:
+    """The median of `values`, shape (K,), K >= 1; NaN when one of them is.
+
+    np.median's to the last bit, at a tenth of its cost (4 against 55 us for 18 of them); and that one imports numpy.ma
+    at its first call.
+    """
+    ordered = np.sort(values)
+    if ordered[-1] != ordered[-1]:  # NaN goes last
+        return math.nan
+    count = len(ordered)
+    if count % 2:
+        return float(ordered[count // 2])
+    return float((ordered[count // 2 - 1] + ordered[count // 2]) / 2)  # in their own type, as numpy does
